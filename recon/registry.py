@@ -4,11 +4,19 @@ What the package asks of a kind stands in its docstring: the same few functions 
 that is a part of the package's `__path__`. Packages are named, not imported, so that a lower room can look a kind up.
 """
 
+from dataclasses import dataclass
 from importlib import import_module
 from pkgutil import iter_modules
 from typing import Any
 
 from pydantic_core import PydanticKnownError
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Marks a field of settings that is chosen by name from a group of `conf/`: the usual choice in it, None for none."""
+
+    name: str | None
 
 
 def names(package: str) -> list[str]:

@@ -12,7 +12,6 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -31,6 +30,7 @@ from pydantic_core import to_jsonable_python
 from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
 from recon.model.part import Kinds
+from recon.registry import Choice
 
 OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
 NEEDED = "???"  # Hydra's mark of a field that needs a value
@@ -45,13 +45,6 @@ def folder() -> Path:
     package = Path(__file__).resolve().parent
     inside = package / "conf"
     return inside if inside.is_dir() else package.parent / "conf"
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Marks a field of a verb's `Config` as a group of conf/: the usual choice in it, None for none."""
-
-    name: str | None
 
 
 def primary(verb: str) -> dict[str, Any]:

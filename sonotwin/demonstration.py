@@ -14,11 +14,12 @@ from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.model.probe import Speed
+from recon.session import optics_step, plan, scene_step, skin_step
 from sonotwin import command_line, pipeline, rendered_session
 from sonotwin.config import defaults
 from sonotwin.pipeline import Step
 from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, WIRES, Rendering
-from sonotwin.verbs import calibrate_optics, calibrate_probe, evaluate, film, fuse, reconstruct, render, surface, track
+from sonotwin.verbs import evaluate, film, reconstruct, render, track
 from twin import board_session
 from twin.evaluation import session_errors, sweep_errors, track_errors
 from twin.optics.surface_session import CameraName
@@ -26,7 +27,7 @@ from twin.reports import demo_report, sweep_report, track_report
 from twin.session import CAPTURE, TRUTH
 
 RESULT, EVALUATION = "result", "evaluation"  # folders
-MESHES = ("surface.ply", "surface.glb")
+MESHES = (skin_step.SKIN, skin_step.GLB)
 REPORT = "report.html"
 Figures = Mapping[str, float | int]
 
@@ -172,7 +173,7 @@ def compare(config: Config) -> Metrics:
     result, truth = config.out / RESULT, config.out / TRUTH
     figures: Metrics = {}
     if config.poses is not None:
-        found = calibration_files.read(result / "optics" / calibrate_optics.OPTICS)
+        found = calibration_files.read(result / "optics" / optics_step.OPTICS)
         figures |= metrics.read(result / "optics" / metrics.FILE) | session_errors.optics(found, truth)
     figures |= metrics.read(result / "surface" / metrics.FILE)
     # what evaluation predicts, in place of the surface's own, is of points that have a truth, by true normals
@@ -195,39 +196,21 @@ def track_film(settings: track.Config) -> Metrics:
 def report(config: Config, found: Figures) -> None:
     """Write the report of all steps."""
     out, result, truth = config.out, config.out / RESULT, config.out / TRUTH
-    optics = result / "optics" / calibrate_optics.OPTICS if config.poses is not None else None
+    optics = result / "optics" / optics_step.OPTICS if config.poses is not None else None
     estimated = None if optics is None else calibration_files.read(optics)
-    story = demo_report.read(out / CAPTURE, truth, result / "surface" / surface.POINTS, config.cameras[0], estimated)
+    story = demo_report.read(out / CAPTURE, truth, result / "surface" / skin_step.POINTS, config.cameras[0], estimated)
     files, inside, tracked, fused = FILES | (FROM_BOARD if optics else {}), None, None, None
     if config.looks_inside:
         files |= FROM_SWEEPS
         expected = sweep_errors.read_truth(truth, SCAN)
         inside = sweep_report.read(result, SCAN, BOTTOM, session_errors.findings(result, expected, SCAN), expected)
         tracked = track_report.read(truth, result / "poses" / SCAN, SCAN)
-        fused = fuse.read(shown_together(config, optics))
+        fused = scene_step.read(plan.kept_scene(config.reconstruction, result, SCAN, optics))
     elif config.filming is not None:
         files |= FROM_FILM
         tracked = track_report.read(out / "film" / TRUTH, out / "track")
     with atomic.listed_file(out, REPORT, pipeline.DEMO) as page:
         demo_report.write(page, story, dict(found), list(files.items()), commands(config), inside, tracked, fused)
-
-
-def shown_together(config: Config, optics: Path | None) -> fuse.Config:
-    """Settings by which all that was found is put into one picture."""
-    result = config.out / RESULT
-    return fuse.Config(
-        rig=config.rig,
-        capture=result / "poses" / SCAN,
-        sweep=SCAN,
-        out=result / "scene" / SCAN,
-        probe=result / "probe" / calibrate_probe.PROBE,
-        lag_s=reconstruct.measured_lag(result / "latency").lag_s,
-        tissue_m_s=config.tissue_m_s,
-        surface=result / "surface" / reconstruct.SKIN,
-        masses=result / "masses" / SCAN,
-        volume=result / "volume" / SCAN,
-        calibration=optics,
-    )
 
 
 def _named(folder: Path, part: str) -> Metrics:

@@ -19,10 +19,11 @@ from recon.files.code_digest import code_digest
 from recon.files.metrics import Metrics, shown
 from recon.probe_calibration import repeatability
 from recon.probe_calibration.sound_in_water import speed_of_sound
+from recon.session import optics_step, plan, probe_step
 from sonotwin import config, rendered_session
 from sonotwin.choices import read_rig
 from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings, choice
-from sonotwin.verbs import calibrate_optics, calibrate_probe, reconstruct
+from sonotwin.verbs import reconstruct
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import session_errors
 from twin.ultrasound.timed_sweep import Clocks
@@ -103,8 +104,14 @@ def settings(conditions: str, seed: int) -> Settings:
 
 def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Path) -> reconstruct.Config:
     """Settings by which a session is reconstructed."""
-    known = {"board_scale": board_scale, "temperature_c": WATER_C, "tissue_m_s": TISSUE_M_S}
-    return reconstruct.Config.model_validate({"rig": chosen.rig, "capture": session / "capture", "out": out, **known})
+    return reconstruct.Config(
+        rig=chosen.rig,
+        capture=session / "capture",
+        out=out,
+        board_scale=board_scale,
+        temperature_c=WATER_C,
+        tissue_m_s=TISSUE_M_S,
+    )
 
 
 def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int, Metrics]:
@@ -112,11 +119,21 @@ def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int
     for part in rendered_session.cylinders(chosen, work / "session"):
         part.run()
     truth = (work / "session" / "truth").rename(work / "truth")
-    optics, probe = by.out / "optics" / calibrate_optics.OPTICS, by.out / "probe" / calibrate_probe.PROBE
-    known = {"calibration": optics, "probe": probe, **reconstruct.measured_lag(by.out / "latency").fields}
-    known |= {"tissue_m_s": speed_of_sound(WATER_C), "tissue_sigma_m_s": WATER_SIGMA_M_S, "board_scale": by.board_scale}
-    own = {"rig": chosen.rig, "capture": work / "session" / "capture", "find": "tube", "out": work / "result"}
-    status = reconstruct.run(reconstruct.Config.model_validate(own | known))
+    lag = plan.measured_lag(by.out / "latency")
+    in_tank = reconstruct.Config(
+        rig=chosen.rig,
+        capture=work / "session" / "capture",
+        out=work / "result",
+        find="tube",
+        calibration=by.out / "optics" / optics_step.OPTICS,
+        probe=by.out / "probe" / probe_step.PROBE,
+        lag_s=lag.lag_s,
+        lag_sigma_s=lag.sigma_s or 0.0,
+        tissue_m_s=float(speed_of_sound(WATER_C)),
+        tissue_sigma_m_s=WATER_SIGMA_M_S,
+        board_scale=by.board_scale,
+    )
+    status = reconstruct.run(in_tank)
     return status, {} if status else session_errors.cylinders(work / "result", truth, TUBE)
 
 

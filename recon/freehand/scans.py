@@ -35,7 +35,7 @@ from recon.geometry import rigid
 from recon.model import fan, lengths, pose_checks, tracks
 from recon.model.fan import Fan
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, Speed, SpeedSigma
-from recon.model.rig import NotNegative
+from recon.model.rig import NotNegative, Part
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 
@@ -60,7 +60,18 @@ SOFT_M_S = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
 KNOWN_TISSUE_M_S = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
 
 
-class ScansFields(SequenceFields):
+class TissueFields(Part):
+    """The sound in what was scanned, by which echoes have their depths."""
+
+    tissue_m_s: Speed | None = None
+    """m/s, of sound in what was scanned: 1540 on average, 1440 to 1480 in fat, 1450 in soft silicone, 1488 in water of 22 deg C.
+    Null leaves depths as of the speed that the probe's calibration holds for; a sequence's own: 1540"""
+    tissue_sigma_m_s: SpeedSigma | None = None
+    """m/s, standard deviation of the former, of which masses' places are uncertain; null: 25 where that is given, as of tissue
+    that is known by its kind alone, and 50 else; fat has 1440 to 1480, glands 1510 to 1570"""
+
+
+class ScansFields(TissueFields, SequenceFields):
     """Fields of a verb that places the B-scans of a capture or of a sequence in the world."""
 
     capture: Path | None = None
@@ -74,12 +85,6 @@ class ScansFields(SequenceFields):
     lag_sigma_s: NotNegative | None = None
     """s, standard deviation of the former, 0 where that is given and 0.1 else, of which the places of pixels are uncertain; of
     a capture only"""
-    tissue_m_s: Speed | None = None
-    """m/s, of sound in what was scanned: 1540 on average, 1440 to 1480 in fat, 1450 in soft silicone, 1488 in water of 22 deg C.
-    Null leaves depths as of the speed that the probe's calibration holds for; a sequence's own: 1540"""
-    tissue_sigma_m_s: SpeedSigma | None = None
-    """m/s, standard deviation of the former, of which masses' places are uncertain; null: 25 where that is given, as of tissue
-    that is known by its kind alone, and 50 else; fat has 1440 to 1480, glands 1510 to 1570"""
     image: FrameName | None = None
     """frame of the sequence that its pixels are in; null is the configuration's, or else Image"""
     config: Path | None = None

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 
-from recon.errors import InputError, validated
+from pydantic import BaseModel
+
+from recon.errors import InputError
 from recon.files import atomic, json_text, metrics
 
 RECORD = "reconstruct.json"
@@ -61,8 +62,9 @@ class Store:
         self,
         name: str,
         does: str,
-        verb: ModuleType,
-        fields: Mapping[str, object],
+        by: str,
+        settings: BaseModel,
+        work: Callable[[Path], object],
         files: Sequence[str],
         made_of: Mapping[str, object],
     ) -> Path | None:
@@ -72,21 +74,21 @@ class Store:
         ----------
         name : of the step, and of its folder
         does : for people
-        verb, fields : module of the verb that does it, with its `Config` and `run`; and its settings, all but `out`
+        by, settings : name of the verb that does the same, and what the step is made by
+        work : does the step, and writes its folder, whole or not at all
         files : that the step hands on; all must be there for it to be kept
         made_of : inputs beside the settings: digests of files and of earlier steps
         """
-        place, of = self.folder / name, verb.__name__.rpartition(".")[2]
+        place = self.folder / name
+        digest = digest_of([self.code, by, settings.model_dump(mode="json"), made_of])
+        if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
+            self.say(f"kept        {name}: {does}, as before")
+            self.done.append(name)
+            return place
+        self.say(f"{name}: {does}")
+        self._change(name, None)
         try:
-            settings = validated(verb.Config, {**fields, "out": place}, of.replace("_", "-"))
-            digest = digest_of([self.code, of, settings.model_dump(mode="json", exclude={"out"}), made_of])
-            if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
-                self.say(f"kept        {name}: {does}, as before")
-                self.done.append(name)
-                return place
-            self.say(f"{name}: {does}")
-            self._change(name, None)
-            verb.run(settings)
+            work(place)
         except InputError as error:
             self.fail(name, str(error))
             return None

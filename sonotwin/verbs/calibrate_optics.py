@@ -13,175 +13,26 @@ fringes are refused, other patterns are tried on three poses.
     sonotwin calibrate-optics capture=board/capture devices=[cam1] out=board/camera
 """
 
-import re
 import shlex
-from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
-from time import perf_counter
-from typing import Literal
 
-from rich.console import Console
-
-from recon.capture import board_part, calibration_files, manifest, meza2021
-from recon.capture.board_part import BoardCapture
-from recon.errors import InputError
-from recon.files import atomic, metrics
-from recon.files.metrics import Metrics, shown
-from recon.model.calibration import Calibration
-from recon.optical_calibration import board_frames, calibration_report, figures_of_merit
-from recon.optical_calibration.board_frames import DeviceName
-from recon.optical_calibration.distortion_selection import ModelName
-from recon.optical_calibration.joint_calibration import Result, Settings, calibrate
-from recon.optical_calibration.observations import PROJECTOR
-from recon.optical_calibration.sightings import Cause, Failure, light
-from recon.pattern_trials import likely_patterns
-from recon.structured_light import surface_figures
+from recon.session import optics_step
 from sonotwin import command_line
-
-PAGE = "calibration.html"
-OPTICS = "optics.yaml"
-MANY, MOST_LISTED = 4, 40  # poses that are dropped alike, which are one line; and of these that it lists
-CONTENTS = {
-    OPTICS: "all devices with the covariance of their parameters; OpenCV FileStorage",
-    meza2021.PARAMETERS: "camera 1 and projector in the rig authors' layout",
-    meza2021.STEREO_PARAMETERS: "camera 1 and camera 2 in the rig authors' layout",
-    meza2021.STEREO_XML: "the same as OpenCV FileStorage",
-    metrics.FILE: "the figures of this page",
-    PAGE: "this page",
-}
+from sonotwin.console_watch import ConsoleWatch
 
 
-class Config(Settings):
+class Config(optics_step.Settings):
     """Fields of `sonotwin calibrate-optics`: sources, target, and settings of the calibration."""
 
-    capture: Path
-    """a capture folder whose manifest has a board part"""
     out: Path
     """folder; gets optics.yaml, the rig authors' files, metrics.json, calibration.html"""
-    truth: Path | None = None
-    """truth/ folder of a rendered capture; only the report compares with it"""
-    devices: tuple[DeviceName, ...] | None = None
-    """that are calibrated, of cam1, cam2 and projector: [cam1,projector], [cam1]; null: all of the capture"""
-    distortion: Literal["auto", ModelName] = "auto"  # as one list of choices, for the message
-    """none, radial1, radial2, decentred, brown, rational, thin_prism, tilted; auto takes, for each device, brown, or rational
-    if that predicts poses left out better"""
 
 
 def run(config: Config) -> None:
-    """Find the board in all poses, adjust, judge and write.
-
-    Raises
-    ------
-    InputError
-        If the capture is incomplete or damaged, doesn't determine the devices, or `out` can't be written to.
-    """
-    console = Console(soft_wrap=True, highlight=False)
-    inputs = [path for path in (config.capture, config.truth) if path is not None]
-    atomic.check_folder(config.out, "calibrate-optics", inputs=inputs)
-    captured = board_part.read_board(config.capture)
-    sizes = board_frames.sizes_of(captured, config.devices)
-    truth = None if config.truth is None else calibration_files.read_for(config.truth / manifest.OPTICS, sizes)
-
-    start = perf_counter()
-    sightings = []
-    with console.status("looking for the board") as status:
-        for number, sighting in enumerate(board_frames.look_at_all(captured, sizes), start=1):
-            sightings.append(sighting)
-            status.update(f"looking for the board, {number} of {len(captured.poses)} poses done")
-    seconds = {"seconds_detect": round(perf_counter() - start, 3)}
-    console.print(f"detect      {board_frames.found_by(sightings, sizes)}, {seconds['seconds_detect']:.0f} s", markup=False)
-    missed = board_frames.not_found(sightings)
-    for line in (*dropped(missed), *surface_figures.bent(light(sightings))):
-        console.print(line, markup=False)
-
-    start = perf_counter()
-    try:
-        board_frames.refuse_lonely(sightings, sizes, captured.name)
-        with console.status("adjusting"):
-            settings = Settings(**{name: getattr(config, name) for name in Settings.model_fields})
-            result = calibrate(sightings, captured.board, sizes, settings, name=captured.name)
-    except InputError as error:
-        others = other_patterns(captured, sizes, console)
-        raise InputError(f"{error} ({others})" if others else str(error)) from None
-    result = board_frames.with_absent(result, sizes, captured.cameras)
-    if PROJECTOR not in result.observations.devices and (others := other_patterns(captured, sizes, console)):
-        result = replace(result, warnings=(*result.warnings, f"{PROJECTOR}: {others}"))
-    if beyond := sum(failure.cause is Cause.CODE_OUTSIDE for failure in missed.values()):
-        cause = "other patterns than those that were shown make a wrong calibration: are projector_size, pitch and start right?"
-        result = replace(
-            result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
-        )
-    seconds["seconds_adjust"] = round(perf_counter() - start, 3)
-    figures = figures_of_merit.measure(result, truth)
-    contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
-    for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
-        console.print(line, markup=False)
-    written = write(config, result, figures | seconds, truth)
-    console.print(f"wrote       {config.out}/{{{','.join(written)}}}", markup=False)
+    """Find the board in all poses, adjust, judge and write; raises InputError as `recon.session.optics_step.run`."""
+    optics_step.run(config, config.out, ConsoleWatch(), command(config))
 
 
-def other_patterns(captured: BoardCapture, sizes: Collection[str], console: Console) -> str:
-    """Fields of the patterns that would fit the images, for messages; nothing if none would, or no projector is calibrated."""
-    if PROJECTOR not in sizes:
-        return ""
-    with console.status("trying other patterns"):
-        fields = likely_patterns.likely(captured)
-    return "" if fields is None else f"the images fit patterns with {fields} in each set of fringes"
-
-
-def dropped(reasons: Mapping[str, str | Failure]) -> Iterator[str]:
-    """Lines: poses and devices left out, with the reasons; one line for many that differ in numbers alone."""
-    alike: dict[tuple[str, str], list[str]] = {}
-    for name, reason in reasons.items():
-        alike.setdefault((name.rpartition(" ")[2], re.sub(r"\d+(\.\d+)?", "#", str(reason))), []).append(name)
-    for (device, _), names in alike.items():
-        if len(names) < MANY:
-            yield from (f"dropped     {name}: {reasons[name]}" for name in names)
-            continue
-        poses = [name.removesuffix(f" {device}") for name in names]
-        listed = ", ".join(poses) if len(poses) <= MOST_LISTED else f"{', '.join(poses[:MOST_LISTED])} and others"
-        yield f"dropped     {device} in {len(names)} poses alike, such as {names[0]}: {reasons[names[0]]} (poses {listed})"
-
-
-def turned(result: Result) -> Iterator[str]:
-    """Lines: poses in which a board that maps onto itself was taken for turned."""
-    for device, poses in result.turned.items():
-        yield f"turned      {', '.join(poses)}: {device} took the board the other way round than in other poses"
-
-
-def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
-    """Lines: predicted errors of points, which are what a calibration is worth; residuals of the poses; true errors; warnings."""
-    devices = result.observations.devices
-    remaining = ", ".join(f"{device} {shown(figures[f'reprojection_rms_{device}_px'], '.4f')}" for device in devices)
-    models = ", ".join(dict.fromkeys(result.model[device] for device in devices))
-    if "point_sigma_mm" in figures:
-        point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
-        scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
-        yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
-    else:
-        seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
-        yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"
-    yield f"adjust      {figures['poses']} poses, {models}; reprojection RMS {remaining} px; {seconds:.0f} s"
-    if "halves_rms_sigma" in figures:
-        rms, worst = (shown(figures[f"halves_{name}_sigma"], ".1f") for name in ("rms", "worst"))
-        yield f"halves      two halves of the poses differ by {rms} predicted sigma (RMS), at most {worst}; 1 is expected"
-    yield f"board       {figures_of_merit.describe_board(result, figures)}"
-    if "point_error_rms_mm" in figures:
-        point, shape = (shown(figures[f"{name}_error_rms_mm"], ".4f", " mm") for name in ("point", "shape"))
-        yield f"error       point {point}, within a shape {shape}, against the true calibration (RMS)"
-    for line in result.warnings:
-        yield f"warning     {line}"
-
-
-def write(config: Config, result: Result, figures: Metrics, truth: Calibration | None) -> list[str]:
-    """Write all files, whole or not at all; returns their names."""
-    found = result.adjustment.calibration
-    with atomic.new_folder(config.out, "calibrate-optics") as folder:
-        calibration_files.write(folder / OPTICS, found)
-        names = [OPTICS, *meza2021.write_parameters(folder, found), metrics.FILE, PAGE]
-        metrics.write(folder / metrics.FILE, figures)
-        outputs = [(name, CONTENTS[name]) for name in names]
-        command = shlex.join(["sonotwin", *command_line.words("calibrate-optics", config)])
-        calibration_report.write(folder / PAGE, result, figures, outputs, [command], truth)
-    return names
+def command(config: Config) -> str:
+    """The command line that gives these settings."""
+    return shlex.join(["sonotwin", *command_line.words("calibrate-optics", config)])

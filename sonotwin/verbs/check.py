@@ -17,7 +17,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
-from rich.console import Console
 
 from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
@@ -31,12 +30,13 @@ from recon.rig_check import bottom_equations, check_log, check_page, fringe_matc
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR, Matches
 from recon.rig_check.verdicts import Optics, Verdict
+from recon.session import poses_step
+from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
 from recon.tracking import track_figures
 from recon.tracking.pose_fit import Sighting
-from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
-from sonotwin.verbs.calibrate_target import tracked
+from sonotwin.console_watch import ConsoleWatch
 
 CHECK, PAGE = "check.json", "check.html"
 SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
@@ -96,7 +96,7 @@ def run(config: Config) -> int:
     InputError
         If the capture is incomplete or damaged or holds nothing that can be checked, or a place can't be written to.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    watch = ConsoleWatch()
     given = (config.capture, config.tracked, config.calibration, config.probe, config.lag, config.target, config.log)
     inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
     atomic.check_folder(config.out, "check", inputs=inputs)
@@ -104,19 +104,19 @@ def run(config: Config) -> int:
     listed = manifest.read_manifest(config.capture)
     held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
     for line in left_out(held):
-        console.print(line, markup=False)
-    found = [*optics(config, listed, held, console)]
-    found += verdicts.doubted(tank(config, held, console), found)
+        watch.say(line)
+    found = [*optics(config, listed, held, watch)]
+    found += verdicts.doubted(tank(config, held, watch), found)
     made = check_log.check(listed.name or config.capture.resolve().name, found)
     for line in check_page.lines(made):
-        console.print(line, markup=False)
-    console.print(f"verdict     {check_page.summary(made.parts)}", markup=False)
+        watch.say(line)
+    watch.say(f"verdict     {check_page.summary(made.parts)}")
     with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
         if config.log is not None:  # last, so that whatever fails leaves both as they were
             check_log.add(config.log, made)
-    console.print(f"wrote       {config.out}/{{{CHECK},{PAGE}}}", markup=False)
+    watch.say(f"wrote       {config.out}/{{{CHECK},{PAGE}}}")
     return int(any(one.state == "moved" for one in found))
 
 
@@ -164,7 +164,7 @@ def left_out(held: Held) -> list[str]:
     return [f"{name:12}{way}" for name, (lacking, way) in ways.items() if lacking]
 
 
-def optics(config: Config, listed: Manifest, held: Held, console: Console) -> list[Verdict]:
+def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> list[Verdict]:
     """Verdicts on cameras, projector and target."""
     if held.film is None and not held.fringes:
         return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
@@ -173,10 +173,10 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
     calibration = calibration_files.read_for(file, sizes)
     if calibration.uncertainty is None:
-        console.print(f"warning     {file}: no covariance: an error of the calibration is taken for a motion", markup=False)
+        watch.say(f"warning     {file}: no covariance: an error of the calibration is taken for a motion")
     target = target_of(config)
-    film = None if held.film is None else filmed(config, held.film, target, calibration, console)
-    matches = matched(config, calibration, console) if held.fringes else None
+    film = None if held.film is None else filmed(config, held.film, target, calibration, watch)
+    matches = matched(config, calibration, watch) if held.fringes else None
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
@@ -184,27 +184,26 @@ def optics(config: Config, listed: Manifest, held: Held, console: Console) -> li
 
 
 def filmed(
-    config: Config, name: str, target: Target, calibration: Calibration, console: Console
+    config: Config, name: str, target: Target, calibration: Calibration, watch: ConsoleWatch
 ) -> list[tuple[Sighting, Sighting]]:
     """Pairs of frames in which both cameras see the target whole, in poses that differ."""
     film = stereo_frames.read_film(config.capture, config.calibration, name)
     wide = config.model_copy(update={"drift_px": SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
-    collected = target_poses.collect(tracked(film, tracker, console), film.cameras)
+    pairs = watch.follow(film.pairs(), len(film.times), "tracking")
+    collected = target_poses.collect((found for _, found in poses_step.follow(tracker, film.times, pairs)), film.cameras)
     poses = target_poses.spread(target_poses.evenly_lit(collected.seen, LEAST_POSES), config.most_poses)
     if len(poses) < LEAST_POSES:
         found = f"{len(poses)} in {len(film.times)} pairs{collected.told}: move it about, clean, uncovered and well lit"
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
     tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
-    console.print(
-        f"film        {len(poses)} poses, tilts of {tilt:.0f} deg (1 sigma), over {reach:.0f} mm of depth", markup=False
-    )
+    watch.say(f"film        {len(poses)} poses, tilts of {tilt:.0f} deg (1 sigma), over {reach:.0f} mm of depth")
     for line in track_figures.second_target(collected.apart_mm):
-        console.print(line, markup=False)
+        watch.say(line)
     return [one.views for one in poses]
 
 
-def matched(config: Config, calibration: Calibration, console: Console) -> Matches:
+def matched(config: Config, calibration: Calibration, watch: ConsoleWatch) -> Matches:
     """Points of the surface that both cameras see."""
     maps = []
     for camera in CAMERAS:
@@ -212,11 +211,11 @@ def matched(config: Config, calibration: Calibration, console: Console) -> Match
         maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {camera}", camera=camera))
     matches = fringe_matches.match((maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED), str(config.capture))
     axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
-    console.print(f"fringes     {len(matches.pixels)} points in both cameras, {axes}", markup=False)
+    watch.say(f"fringes     {len(matches.pixels)} points in both cameras, {axes}")
     return matches
 
 
-def tank(config: Config, held: Held, console: Console) -> list[Verdict]:
+def tank(config: Config, held: Held, watch: ConsoleWatch) -> list[Verdict]:
     """Verdicts on probe and clock."""
     parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
     if held.bottom is None:
@@ -228,13 +227,13 @@ def tank(config: Config, held: Held, console: Console) -> list[Verdict]:
             f"{config.capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe"
         )
     if probe.uncertainty is None:
-        console.print("warning     probe: no covariance: an error of its calibration is taken for a bent bracket", markup=False)
+        watch.say("warning     probe: no covariance: an error of its calibration is taken for a bent bracket")
     lag = None if config.lag is None else lag_files.read(config.lag)
     known = Known(in_water(probe, config), *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)))
     lines = bottom_equations.lines_of(sweep.images(), sweep.times, sweep.size, config.top_px)
     found, lag_s = verdicts.of_bottom(lines, sweep.track, known, sweep.size, config.speed_mm_s, config.alarm_sigma)
     shown = int(np.isfinite(lines.pixels).all(axis=(1, 2)).sum())
-    console.print(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms", markup=False)
+    watch.say(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms")
     return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
 
 

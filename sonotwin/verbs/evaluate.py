@@ -14,7 +14,7 @@ from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
 from recon.model.rig import Part
 from recon.reports import figures
-from sonotwin.verbs.surface import POINTS
+from recon.session.skin_step import POINTS
 from twin.evaluation import surface_errors
 from twin.reports import error_report
 

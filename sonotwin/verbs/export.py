@@ -48,7 +48,7 @@ from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import mass_files
 from recon.segmentation.scan_masks import mask_of
-from sonotwin.verbs.surface import POINTS
+from recon.session.skin_step import POINTS
 
 MEZA = "meza2021"
 

@@ -39,10 +39,10 @@ from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from recon.probe_calibration import sound_in_water
+from recon.registry import Choice
+from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
 from recon.tracking.tracker import Tracker
-from sonotwin.config import Choice
 from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
-from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
 
 LOOK_S = 0.2  # between two looks whether all goes on
 

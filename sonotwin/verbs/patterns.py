@@ -28,7 +28,7 @@ from recon.capture.manifest import axes_not_encoded
 from recon.files import atomic
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
-from sonotwin.config import Choice
+from recon.registry import Choice
 
 SHEET = "timing_sheet.csv"
 SEQUENCE = "patterns.yaml"

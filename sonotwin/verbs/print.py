@@ -24,7 +24,7 @@ from recon.errors import InputError
 from recon.files import atomic
 from recon.model.boards import AsymmetricCircles, Board
 from recon.model.rig import Rig, Target
-from sonotwin.config import Choice
+from recon.registry import Choice
 from sonotwin.verbs.describe import design
 
 USUAL = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9)  # as conf/scene/board.yaml

@@ -39,6 +39,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import NotNegative, Part, Rig, Vector
 from recon.model.tracks import LagSeconds
+from recon.registry import Choice
 from recon.segmentation import containment, mass_files
 from recon.skin_projection import (
     curve_files,
@@ -54,7 +55,6 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
-from sonotwin.config import Choice
 from sonotwin.open_devices import LiveDevices, of_a_laboratory, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"

@@ -46,8 +46,8 @@ from recon.errors import InputError, validated
 from recon.model.boards import AsymmetricCircles, Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
+from recon.registry import Choice
 from recon.tracking import networks
-from sonotwin.config import Choice
 from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
 from twin.session import CAPTURE, TRUTH

@@ -16,6 +16,7 @@ from recon.capture import probe_files, sweep_tables
 from recon.geometry import rigid
 from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
 from sonotwin import config
+from sonotwin.choices import read_rig
 from sonotwin.cli import main
 from sonotwin.verbs import calibrate_probe, reconstruct
 from tests import added
@@ -373,4 +374,5 @@ def test_a_scale_that_was_given_counts_in_reconstruct_too(given, sy, tmp_path):
     whole = config.load("reconstruct", [*given, "capture=c", "out=o"], reconstruct.Config)
     passed = calibrate_probe.Config(rig=whole.rig, scale_given=whole.scale_given, pairs="p.csv", out="o")
     for one in (own, passed):
-        assert one.scanner_sy is None if sy is None else one.scanner_sy == pytest.approx(sy, nan_ok=True)
+        found = one.scanner_sy(one.rig.probe, read_rig().probe)
+        assert found is None if sy is None else found == pytest.approx(sy, nan_ok=True)

@@ -11,8 +11,8 @@ from recon.freehand import scans, sequence_checks, sequence_sweep, sequences
 from recon.freehand.sequences import FrameNames, Frames
 from recon.geometry import rigid
 from recon.model.pose_checks import LOST
+from recon.session import volume_step
 from sonotwin.cli import main
-from sonotwin.verbs import freehand
 
 COUNT = 30
 NAMES = FrameNames(reference="Tracker")
@@ -241,7 +241,7 @@ def test_a_spacing_that_leaves_gaps_is_advised_against(frames, tmp_path):
     path = tmp_path / "s.igs.mha"
     sequences.write_sequence(path, frames)
     placed = scans.of_sequence(path, NAMES)
-    (said,) = freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.1))
+    (said,) = volume_step.advice(placed, scans.VolumeSettings(spacing_mm=0.1))
     assert said.startswith("advice      B-scans or pixels are up to 1.5 mm apart") and "give spacing_mm=0.2, " in said
-    assert not list(freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.2)))
-    assert "give spacing_mm=1.5, " in next(freehand.advice(placed, scans.VolumeSettings(spacing_mm=0.5, hole_voxels=0)))
+    assert not list(volume_step.advice(placed, scans.VolumeSettings(spacing_mm=0.2)))
+    assert "give spacing_mm=1.5, " in next(volume_step.advice(placed, scans.VolumeSettings(spacing_mm=0.5, hole_voxels=0)))

@@ -2,6 +2,7 @@
 
 import json
 import os
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,130 +14,121 @@ from recon.session.store import RECORD, Store, files_of
 
 
 class Settings(BaseModel):
-    """Of a verb with one field."""
+    """Of a step with one field."""
 
     value: str
-    out: Path
 
 
 @pytest.fixture
-def verb():
-    """A verb that writes its field into a file; it notes its calls, and fails or is interrupted after that as told."""
+def work():
+    """A step that writes its field into a file; it notes its calls, and fails or is interrupted after that as told."""
     calls, fault = [], []
 
-    def run(config):
-        calls.append(config.value)
-        config.out.mkdir(parents=True, exist_ok=True)
+    def run(settings, out):
+        calls.append(settings.value)
+        out.mkdir(parents=True, exist_ok=True)
         for name in ("result.txt", "metrics.json"):
-            (config.out / name).write_text(config.value)
+            (out / name).write_text(settings.value)
         if fault:
             raise fault.pop()
 
-    return SimpleNamespace(__name__="verbs.verb", run=run, Config=Settings, calls=calls, fault=fault)
+    return SimpleNamespace(run=run, calls=calls, fault=fault)
 
 
-def done(folder: Path, verb, value: str = "1", source: Path | None = None, say=lambda line: None, code: str = "a") -> Store:
+def done(folder: Path, work, value: str = "1", source: Path | None = None, say=lambda line: None, code: str = "a") -> Store:
     """A run of one step."""
     steps = Store(folder, say, code)
     with steps.opened([]):
         made_of = {"files": files_of([source] if source else [])}
-        steps.do("part", "a part", verb, {"value": value}, ("result.txt",), made_of)
+        settings = Settings(value=value)
+        steps.do("part", "a part", "verb", settings, partial(work.run, settings), ("result.txt",), made_of)
     return steps
 
 
-def test_a_step_is_done_once(tmp_path, verb):
-    assert done(tmp_path, verb).done == ["part"] == done(tmp_path, verb).done
-    assert verb.calls == ["1"]
+def test_a_step_is_done_once(tmp_path, work):
+    assert done(tmp_path, work).done == ["part"] == done(tmp_path, work).done
+    assert work.calls == ["1"]
 
 
-def test_a_step_is_done_again_for_another_setting_a_changed_file_or_a_lost_one(tmp_path, verb):
+def test_a_step_is_done_again_for_another_setting_a_changed_file_or_a_lost_one(tmp_path, work):
     source = tmp_path / "source.txt"
     source.write_text("a")
     out = tmp_path / "out"
-    done(out, verb, "1", source)
-    done(out, verb, "2", source)
+    done(out, work, "1", source)
+    done(out, work, "2", source)
     os.utime(source, ns=(1, 1))
-    done(out, verb, "2", source)
+    done(out, work, "2", source)
     for name in ("result.txt", "metrics.json"):
         (out / "part" / name).unlink()
-        done(out, verb, "2", source)
-    assert verb.calls == ["1", "2", "2", "2", "2"]
+        done(out, work, "2", source)
+    assert work.calls == ["1", "2", "2", "2", "2"]
 
 
-def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, verb):
+def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, work):
     lines = []
-    done(tmp_path, verb)
-    verb.fault.append(InputError("capture: expected frames, found none"))
-    steps = done(tmp_path, verb, "2", say=lines.append)
+    done(tmp_path, work)
+    work.fault.append(InputError("capture: expected frames, found none"))
+    steps = done(tmp_path, work, "2", say=lines.append)
     assert steps.failed == ["part"] and steps.digest("part") == {} and steps.done == []
     assert lines[-1] == f"left out    part: capture: expected frames, found none; {tmp_path / 'part'} is of an earlier run"
-    done(tmp_path, verb, "1")
-    assert verb.calls == ["1", "2", "1"], "the result of before no longer counts"
+    done(tmp_path, work, "1")
+    assert work.calls == ["1", "2", "1"], "the result of before no longer counts"
 
 
 @pytest.mark.parametrize("before", [None, "1"])
-def test_an_interrupted_step_is_done_by_the_next_run(tmp_path, verb, before):
+def test_an_interrupted_step_is_done_by_the_next_run(tmp_path, work, before):
     """Also where the run was stopped after the folder had been replaced: what is there is of other settings then."""
     if before:
-        done(tmp_path, verb, before)
-    verb.fault.append(KeyboardInterrupt())
+        done(tmp_path, work, before)
+    work.fault.append(KeyboardInterrupt())
     with pytest.raises(KeyboardInterrupt):
-        done(tmp_path, verb, "2")
+        done(tmp_path, work, "2")
     assert json.loads((tmp_path / RECORD).read_text()) == {}
-    assert done(tmp_path, verb, "1").done == ["part"] and verb.calls[-1] == "1"
+    assert done(tmp_path, work, "1").done == ["part"] and work.calls[-1] == "1"
     assert (tmp_path / "part" / "result.txt").read_text() == "1"
 
 
-def test_a_step_is_done_again_by_other_code(tmp_path, verb):
+def test_a_step_is_done_again_by_other_code(tmp_path, work):
     for code in "aab":
-        done(tmp_path, verb, code=code)
-    assert verb.calls == ["1", "1"]
+        done(tmp_path, work, code=code)
+    assert work.calls == ["1", "1"]
 
 
-def test_settings_that_are_none_fail_the_step(tmp_path, verb):
-    """As its verb would refuse them, in one line."""
-    lines, steps = [], None
-    with Store(tmp_path, lines.append, "a").opened([]):
-        steps = Store(tmp_path, lines.append, "a")
-        assert steps.do("part", "a part", verb, {"value": 3}, (), {}) is None
-    assert steps.failed == ["part"] and "verb: value: " in lines[0] and verb.calls == []
-
-
-def test_what_builds_on_a_step_changes_with_it(tmp_path, verb):
-    first, second = (done(tmp_path, verb, value).digest("part", "another") for value in "12")
+def test_what_builds_on_a_step_changes_with_it(tmp_path, work):
+    first, second = (done(tmp_path, work, value).digest("part", "another") for value in "12")
     assert list(first) == ["part"] and second != first
 
 
-def test_results_that_are_no_part_of_a_run_are_named_once(tmp_path, verb):
+def test_results_that_are_no_part_of_a_run_are_named_once(tmp_path, work):
     lines = []
-    done(tmp_path, verb)
+    done(tmp_path, work)
     for _ in range(2):
         with Store(tmp_path, lines.append, "a").opened([]):
             pass
     assert lines == ["stale       part: of an earlier run, and no part of this result"]
 
 
-def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, verb):
+def test_a_beginning_that_was_killed_is_no_obstacle(tmp_path, work):
     """Its list was not yet there, but the hidden files by which it is written."""
     for name in ("..sonotwin.json.lock", "..sonotwin.77.new.json"):
         (tmp_path / name).write_text("")
-    assert done(tmp_path, verb).done == ["part"]
+    assert done(tmp_path, work).done == ["part"]
 
 
 @pytest.mark.parametrize("content", ["not JSON", "[1, 2]", ""])
-def test_a_changed_record_is_refused_and_a_lost_one_costs_work_alone(tmp_path, verb, content):
-    done(tmp_path, verb)
+def test_a_changed_record_is_refused_and_a_lost_one_costs_work_alone(tmp_path, work, content):
+    done(tmp_path, work)
     (tmp_path / RECORD).write_text(content)
     with pytest.raises(
         InputError,
         match=r"reconstruct\.json: expected nothing or a file as reconstruct wrote it, found it changed since",
     ):
-        done(tmp_path, verb)
+        done(tmp_path, work)
     (tmp_path / RECORD).unlink()
-    assert done(tmp_path, verb).done == ["part"] and verb.calls == ["1", "1"]
+    assert done(tmp_path, work).done == ["part"] and work.calls == ["1", "1"]
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path, verb):
+def test_a_folder_of_something_else_is_refused(tmp_path, work):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(InputError, match=r"expected a new or empty folder, or one that reconstruct wrote"):
-        done(tmp_path, verb)
+        done(tmp_path, work)

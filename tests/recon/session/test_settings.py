@@ -6,7 +6,7 @@ import pytest
 from recon.capture import target_files
 from recon.capture.manifest import CAMERAS
 from recon.errors import InputError
-from sonotwin.tracker_fields import MeasuredTargetFields, make_tracker, target_of
+from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,430 @@
+"""The experiment: the steps that a capture allows, in their order, each in a folder of its own, and why one is left out."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import model_validator
+
+from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
+from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
+from recon.errors import Implausible, InputError
+from recon.files import atomic, metrics
+from recon.freehand.scans import ScansFields, TissueFields
+from recon.model.rig import Finite, NotNegative, Positive, Probe, Rig
+from recon.model.tracks import LagSeconds
+from recon.probe_calibration import sound_in_water
+from recon.registry import Choice
+from recon.session import (
+    latency_step,
+    masses_step,
+    optics_step,
+    poses_step,
+    probe_step,
+    scene_step,
+    skin_step,
+    store,
+    volume_step,
+)
+from recon.session.settings import EchoFields, ScaleFields, TargetField, TrackingFields
+from recon.session.store import Store, files_of
+from recon.session.watch import SILENT, Watch
+from recon.tracking import networks
+from recon.tracking.results import POSES
+
+NO_OPTICS = "no calibration of the cameras: no board, and none given"
+NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
+NO_LAG = "latency failed; give lag_s"
+Command = Callable[[optics_step.Settings, Path], str]
+
+
+class Settings(EchoFields, TissueFields, TargetField, TrackingFields, ScaleFields):
+    """Source, and what is known beforehand."""
+
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design, and rig.probe: where the bracket holds the probe, and the scanner's mm/px"""
+    capture: Path
+    """a capture folder with any parts, as docs/captures.md describes"""
+    camera: str = "cam1"
+    """which camera's fringes the surface is made of"""
+    calibration: Path | None = None
+    """file: cameras and projector, in place of those from the board or in the capture"""
+    probe: Path | None = None
+    """file: the probe's calibration, in place of that from crossed wires or in the capture"""
+    lag_s: LagSeconds | None = None
+    """s, delay of the B-scans' time stamps, in place of that from a flat bottom"""
+    lag_sigma_s: NotNegative = 0.0
+    """s, standard deviation of a lag_s that is given"""
+    implausible: Implausible = "refuse"
+    """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them. Likewise images
+    by light that make no scene"""
+    temperature_c: Finite | None = None
+    """deg C, of the water about the wires; null leaves depths right for that water. Needed of another scanner"""
+    spacing_mm: Positive = 0.5
+    """mm, of a volume's voxels"""
+    find: Literal["masses", "tube", "nothing"] = "masses"
+    """in the B-scans: masses, darker than the tissue around them; tube, round, in water, and the body about it; nothing"""
+    overlays: bool = False
+    """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
+
+    @model_validator(mode="after")
+    def _sigma_of_a_lag(self) -> "Settings":
+        if self.lag_sigma_s and self.lag_s is None:
+            raise ValueError(f"lag_sigma_s: expected with a lag_s that is given, found {self.lag_sigma_s:g} without")
+        return self
+
+
+class Lag(NamedTuple):
+    """The lag of the scanner's images behind the poses; nothing where it is assumed, as each step assumes it with its sigma."""
+
+    lag_s: float | None = None
+    sigma_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What all steps read: the settings, and the capture's parts."""
+
+    settings: Settings
+    held: Manifest
+    usual: Probe
+    watch: Watch
+    command: Command
+
+    @property
+    def sweeps(self) -> dict[str, SweepPart]:
+        """Sweeps by name."""
+        return self.held.named_sweeps
+
+    def files(self, *parts: str) -> dict[str, object]:
+        """Files of some parts, by which a step's inputs are known."""
+        root = self.settings.capture / self.held.root
+        paths = [root / name for part in parts for name in self.held.part(part).paths()]
+        folders = sorted({path if is_sweep(part) else path.parent for part in parts for path in paths})
+        described = {part: self.held.part(part).model_dump(mode="json") for part in parts}
+        return {"files": files_of(folders), "parts": described, "devices": self.held.model_dump(mode="json")["devices"]}
+
+
+def run(settings: Settings, out: Path, code: str, usual: Probe, watch: Watch = SILENT, command: Command | None = None) -> Store:
+    """Do all steps that the capture allows; returns what was done, and what could not be.
+
+    Parameters
+    ----------
+    code : digest of the code that does the steps
+    usual : the probe of the usual rig, beside which it shows whether a scale was given
+    command : the command line that calibrates the optics likewise, for their page
+
+    Raises
+    ------
+    InputError
+        If the manifest is wrong, a given file is missing, or `out` can't be written to.
+    """
+    sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command or (lambda *_: ""))
+    steps = Store(out, watch.announce, code)
+    given = [path for path in (settings.calibration, settings.target, settings.probe, settings.networks) if path is not None]
+    check(sources)
+    with steps.opened([settings.capture, *given]):
+        optics = calibrated_optics(steps, sources)
+        skin = measured_skin(steps, sources, optics)
+        tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
+        lag = measured_latency(steps, sources, tracked)
+        probe = calibrated_probe(steps, sources, tracked, lag)
+        for name, part in sources.sweeps.items():
+            if part.purpose in (None, "volume") and SCANNER in part.images:
+                look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
+        with atomic.listed_file(out, metrics.FILE, store.BY) as temporary:
+            metrics.write(temporary, figures(out, steps))
+    if not steps.done:
+        watch.say("nothing     could be done: give what was left out, such as calibration=FILE, probe=FILE")
+    watch.say(f"wrote       {out}/{{{','.join([*steps.done, metrics.FILE])}}}")
+    return steps
+
+
+def check(sources: Sources) -> None:
+    """Check, before any long work, what can be known beforehand.
+
+    Raises
+    ------
+    InputError
+        If a given file is missing or damaged, the capture has no part, its fringes are of another camera, or water has no such
+        temperature.
+    """
+    settings, held = sources.settings, sources.held
+    for key in ("calibration", "target", "probe"):
+        given: Path | None = getattr(settings, key)
+        if given is not None and not given.is_file():
+            raise InputError(f"{key}: expected a file, found {'a folder' if given.is_dir() else 'nothing'} at {given}")
+    if settings.calibration is not None:
+        calibration_files.read(settings.calibration)
+    if settings.target is not None:
+        target_files.read(settings.target, settings.rig.target)
+    if settings.probe is not None:
+        probe_files.read(settings.probe)
+    if settings.networks is not None and not settings.networks.exists():
+        raise InputError(f"networks: expected a folder or a file, found nothing at {settings.networks}")
+    path = settings.capture / MANIFEST
+    if not held.contents:
+        raise InputError(f"{path}: expected a surface, a board or a sweep, found none of them")
+    if held.surface is not None and settings.camera not in held.surface.images:
+        raise InputError(
+            f"{path}: surface.images: expected {settings.camera}, found {', '.join(held.surface.images)}; give camera=..."
+        )
+    if settings.temperature_c is not None:
+        sound_in_water.speed_of_sound(settings.temperature_c)
+
+
+def calibrated_optics(steps: Store, sources: Sources) -> Path | None:
+    """The calibration of cameras and projector: the one given, the board's, or the capture's own."""
+    settings, held = sources.settings, sources.held
+    own = None if held.calibration is None else settings.capture / held.calibration
+    if settings.calibration is not None:
+        return steps.take("optics", settings.calibration, "as given")
+    if held.board is None:
+        return None if own is None else steps.take("optics", own, "the capture's own, as it has no board")
+    if held.board.patterns is None and held.surface is not None and own is not None:
+        steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
+        return own
+    own_settings = optics_step.Settings(capture=settings.capture)
+
+    def work(out: Path) -> None:
+        optics_step.run(own_settings, out, sources.watch, sources.command(own_settings, out))
+
+    does, files = "cameras and projector, from the board", (optics_step.OPTICS, optics_step.PAGE)
+    made = steps.do("optics", does, optics_step.BY, own_settings, work, files, sources.files("board"))
+    return None if made is None else made / optics_step.OPTICS
+
+
+def measured_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
+    """The surface by light."""
+    settings = sources.settings
+    if sources.held.surface is None:
+        return None
+    if optics is None:
+        return steps.leave_out("surface", _no(steps, "optics", NO_OPTICS))
+    by_light = skin_step.Settings(
+        capture=settings.capture, calibration=optics, camera=settings.camera, implausible=settings.implausible
+    )
+    made_of, files = sources.files("surface") | _known_by(steps, "optics", optics), (skin_step.POINTS, skin_step.SKIN)
+    work = partial(skin_step.run, by_light, watch=sources.watch)
+    made = steps.do("surface", "the surface, from fringes", skin_step.BY, by_light, work, files, made_of)
+    return None if made is None else made / skin_step.SKIN
+
+
+def tracked_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
+    """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
+    settings, part, step = sources.settings, sources.sweeps[name], _step_of("poses", name)
+    filmed = set(CAMERAS) <= part.images.keys()
+    if part.track is not None and (optics is None or not filmed):
+        return settings.capture
+    if not filmed:
+        return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
+    if optics is None:
+        return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
+    tracking = poses_step.Settings(
+        rig=settings.rig,
+        capture=settings.capture,
+        sweep=name,
+        calibration=optics,
+        naming=settings.naming,
+        drift_px=settings.drift_px,
+        board_scale=settings.board_scale,
+        target=settings.target,
+        networks=settings.networks,
+        overlays=settings.overlays,
+    )
+    weights = settings.networks or networks.WEIGHTS
+    made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
+    files = (POSES, MANIFEST) if SCANNER in part.images else (POSES,)
+    work = partial(poses_step.run, tracking, watch=sources.watch)
+    return steps.do(step, "poses of the probe, from frames", poses_step.BY, tracking, work, files, made_of)
+
+
+def measured_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> Lag | None:
+    """The scanner's latency: the one given, that of the last sweep over a flat bottom, or 0 without one; None if it failed."""
+    settings, name = sources.settings, _last(sources, "latency")
+    if settings.lag_s is not None:
+        return Lag(settings.lag_s, settings.lag_sigma_s)
+    if name is None:
+        steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
+        return Lag()
+    if tracked[name] is None:
+        return steps.fail("latency", f"no poses of the sweep {name}")
+    over_bottom = latency_step.Settings(capture=tracked[name], sweep=name, implausible=settings.implausible)
+    does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
+    work = partial(latency_step.run, over_bottom, watch=sources.watch)
+    made = steps.do("latency", does, latency_step.BY, over_bottom, work, (latency_step.LAG,), made_of)
+    return None if made is None else measured_lag(made)
+
+
+def measured_lag(folder: Path) -> Lag:
+    """The lag that `sonotwin measure-lag` wrote into a folder; InputError as of `recon.capture.lag_files.read`."""
+    found = lag_files.read(folder / lag_files.FILE)
+    return Lag(found.lag_s, found.sigma_s)
+
+
+def calibrated_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path | None], lag: Lag | None) -> Path | None:
+    """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
+    settings, name = sources.settings, _last(sources, "probe")
+    if settings.probe is not None:
+        return steps.take("probe", settings.probe, "as given")
+    if name is None:
+        return None if sources.held.probe is None else _own_probe(steps, settings, settings.capture / sources.held.probe)
+    if tracked[name] is None or lag is None:
+        return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
+    over_wires = probe_step.Settings(
+        rig=settings.rig,
+        capture=tracked[name],
+        sweep=name,
+        lag_s=lag.lag_s or 0.0,
+        implausible=settings.implausible,
+        temperature_c=settings.temperature_c,
+        scale_given=settings.scale_given,
+    )
+    does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
+    work = partial(probe_step.run, over_wires, usual=sources.usual, watch=sources.watch)
+    made = steps.do("probe", does, probe_step.BY, over_wires, work, (probe_step.PROBE, probe_step.FRAMES), made_of)
+    return None if made is None else made / probe_step.PROBE
+
+
+def _own_probe(steps: Store, settings: Settings, own: Path) -> Path:
+    """The calibration that the capture has, as it has no wires."""
+    unused = "" if settings.temperature_c is None else "; temperature_c is for wires, and isn't used"
+    return steps.take("probe", own, f"the capture's own, as it has no sweep over crossed wires{unused}")
+
+
+def look_inside(
+    steps: Store,
+    sources: Sources,
+    name: str,
+    capture: Path | None,
+    probe: Path | None,
+    lag: Lag | None,
+    skin: Path | None,
+    optics: Path | None,
+) -> None:
+    """The volume of a sweep, and what is found in its B-scans."""
+    settings, volume = sources.settings, _step_of("volume", name)
+    if capture is None or lag is None or probe is None:
+        no_poses = f"no poses of the sweep {name}".rstrip()
+        reason = no_poses if capture is None else NO_LAG if lag is None else _no(steps, "probe", NO_PROBE)
+        wanted = {"masses": ("volume", "masses", "scene"), "tube": ("volume", "tube"), "nothing": ("volume",)}[settings.find]
+        for kind in wanted:
+            steps.leave_out(_step_of(kind, name), reason)
+        return None
+    placed = ScansFields(
+        capture=capture,
+        sweep=name,
+        probe=probe,
+        lag_s=lag.lag_s,
+        lag_sigma_s=lag.sigma_s,
+        tissue_m_s=settings.tissue_m_s,
+        tissue_sigma_m_s=settings.tissue_sigma_m_s,
+        implausible=settings.implausible,
+    )
+    compounding = volume_step.Settings(**dict(placed), spacing_mm=settings.spacing_mm)
+    made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
+    work = partial(volume_step.run, compounding, watch=sources.watch)
+    voxels = steps.do(volume, "B-scans in a volume", volume_step.BY, compounding, work, (volume_step.VOLUME,), made_of)
+    if settings.find == "nothing":
+        return None
+    if skin is not None:
+        made_of |= {"skin": steps.digest("surface")}
+    does, found = f"{'masses' if settings.find == 'masses' else 'a tube'} in the B-scans", _step_of(settings.find, name)
+    sought = masses_step.Settings(
+        **dict(placed), surface=skin, kind=settings.find, spread_mm=settings.spread_mm, slice_mm=settings.slice_mm
+    )
+    work = partial(masses_step.run, sought, watch=sources.watch)
+    masses = steps.do(found, does, masses_step.BY, sought, work, (), made_of)
+    if settings.find == "masses":
+        shown = shown_together(settings, placed, skin, optics, masses, voxels)
+        made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics"), "volume": steps.digest(volume)}
+        work = partial(scene_step.run, shown, watch=sources.watch)
+        steps.do(_step_of("scene", name), "all of it in one picture", scene_step.BY, shown, work, (scene_step.SCENE,), made_of)
+    return None
+
+
+def shown_together(
+    settings: Settings,
+    placed: ScansFields,
+    skin: Path | None,
+    optics: Path | None,
+    masses: Path | None,
+    volume: Path | None,
+) -> scene_step.Settings:
+    """Settings by which all that was found about a sweep is put into one picture."""
+    assert placed.capture is not None
+    return scene_step.Settings(
+        rig=settings.rig,
+        capture=placed.capture,
+        sweep=placed.sweep,
+        implausible=placed.implausible,
+        probe=placed.probe,
+        lag_s=placed.lag,
+        tissue_m_s=placed.tissue_m_s,
+        surface=skin,
+        masses=masses,
+        volume=volume,
+        calibration=optics,
+    )
+
+
+def kept_scene(settings: Settings, out: Path, sweep: str, optics: Path | None) -> scene_step.Settings:
+    """Settings by which the results in a folder, of a run that left nothing out, are in one picture.
+
+    optics : the calibration that all was measured with; None for the capture's own
+
+    Raises
+    ------
+    InputError
+        If the folder has no lag.
+    """
+    lag = measured_lag(out / "latency")
+    placed = ScansFields(
+        capture=out / "poses" / sweep,
+        sweep=sweep,
+        probe=out / "probe" / probe_step.PROBE,
+        lag_s=lag.lag_s,
+        lag_sigma_s=lag.sigma_s,
+        tissue_m_s=settings.tissue_m_s,
+        implausible=settings.implausible,
+    )
+    skin = out / "surface" / skin_step.SKIN
+    return shown_together(settings, placed, skin, optics, out / "masses" / sweep, out / "volume" / sweep)
+
+
+def figures(out: Path, steps: Store) -> metrics.Metrics:
+    """Figures of all steps that are done, less those of the clock, by the step's name."""
+    found: metrics.Metrics = {}
+    for name in steps.done:
+        read = metrics.read(out / name / metrics.FILE)
+        timeless = {key: value for key, value in read.items() if not key.startswith("seconds_") and key != "frames_per_s"}
+        found |= {f"{name.replace('/', '_')}_{key}": value for key, value in timeless.items()}
+    return found
+
+
+def _step_of(kind: str, sweep: str) -> str:
+    """Name of the step of a kind that a sweep has to itself."""
+    return f"{kind}/{sweep}" if sweep else kind
+
+
+def _no(steps: Store, step: str, reason: str) -> str:
+    """The reason for what is missing: the step that should have made it failed, or there was none."""
+    return f"{step} failed" if step in steps.failed else reason
+
+
+def _last(sources: Sources, purpose: str) -> str | None:
+    """The last sweep for a purpose that has B-scans; None without one."""
+    fitting = [name for name, part in sources.sweeps.items() if part.purpose == purpose and SCANNER in part.images]
+    return fitting[-1] if fitting else None
+
+
+def _scans(steps: Store, sources: Sources, name: str) -> dict[str, object]:
+    """Inputs of a step that reads a sweep's B-scans and poses."""
+    return sources.files(sweep_part(name)) | {"poses": steps.digest(_step_of("poses", name))}
+
+
+def _known_by(steps: Store, step: str, *files: Path) -> dict[str, object]:
+    """Digest of an earlier step, and of the files that it made or that stand in its place."""
+    return {step: [steps.digest(step), files_of(files)]}

@@ -1,0 +1,182 @@
+"""The ultrasound probe from B-scans of crossed wires: the settings of the step, the step, and the files of its result."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+from pydantic import model_validator
+
+from recon.capture import probe_files, sweep_part, sweep_tables
+from recon.capture.sweep_part import SweepCapture
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+from recon.freehand import sequence_sweep
+from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
+from recon.freehand.sequences import FrameNames
+from recon.freehand.volume_compounding import Clip, Rectangle
+from recon.model.rig import Probe, Rig
+from recon.model.tracks import LagSeconds
+from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
+from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration.tank_calibration import Result
+from recon.registry import Choice
+from recon.session.settings import ScaleFields
+from recon.session.watch import SILENT, Watch
+
+BY = "calibrate-probe"  # who writes
+PROBE = "probe.yaml"
+FRAMES = "frames.csv"
+
+
+class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
+    """Sources, and all that is known beforehand."""
+
+    rig: Annotated[Rig, Choice("meza2021")]
+    """rig.probe is the design: where the bracket holds the probe to some 30 deg and 30 mm, the scanner's mm/px. Of another
+    probe give temperature_c, and with pairs rig.probe.image_size; its bracket needs no design"""
+    capture: Path | None = None
+    """a capture folder with a sweep over the crossing of two wires at rest. Or else:"""
+    sweep: str = ""
+    """its name, of a capture that holds several; "" takes the only one for the probe"""
+    pairs: Path | None = None
+    """CSV file of poses and pixels, one pair a line: m00 to m23 of world_from_target in mm, u, v in px"""
+    earlier: Path | None = None
+    """an earlier calibration of the same probe, probe.yaml: whether it moved in its bracket since"""
+    clip: Rectangle | None = None
+    """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is all of it. The
+    calibration holds for the whole images all the same"""
+    lag_s: LagSeconds = 0.0
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> "Settings":
+        given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected one of capture, sequence and pairs, found {' and '.join(given) or 'none'}")
+        for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None)):
+            if self.pairs is not None and value is not None:
+                raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
+        return self
+
+
+@dataclass(frozen=True)
+class CalibratedProbe:
+    """A probe with the covariance of its calibration, and the outcome of each frame."""
+
+    frames: CrossingFrames
+    result: Result
+    figures: Metrics
+
+
+def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> None:
+    """Find the crossing in all frames, calibrate, judge and write.
+
+    Parameters
+    ----------
+    usual : the probe of the usual rig, beside which it shows whether a scale was given
+
+    Raises
+    ------
+    InputError
+        If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
+    """
+    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker)
+    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
+    if settings.temperature_c is not None:
+        sound_in_water.speed_of_sound(settings.temperature_c)  # a mistake shows before the work
+    design, start = settings.rig.probe, perf_counter()
+    if settings.pairs is not None:
+        frames = crossing_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
+    else:
+        frames = look(read(settings), settings, settings.lag_s, settings.clip, watch)
+    seconds = {"seconds_find": round(perf_counter() - start, 3)}
+    for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
+        watch.say(line)
+    found = calibrate(frames, design, settings, settings.scanner_sy(design, usual), watch)
+    figures = found.figures
+    if earlier is not None:
+        figures = figures | probe_figures.compare(found.result.calibration, earlier)
+        watch.say(probe_figures.describe_comparison(figures, settings.earlier))
+    written = write(out, found, figures | seconds)
+    watch.say(f"wrote       {out}/{{{','.join(written)}}}")
+
+
+def look(
+    sweep: SweepCapture | SequenceSweep,
+    settings: tank_calibration.Settings | None = None,
+    lag_s: float = 0.0,
+    clip: Rectangle | None = None,
+    watch: Watch = SILENT,
+) -> CrossingFrames:
+    """Find the crossing in the B-scans of a sweep, read one by one.
+
+    Parameters
+    ----------
+    lag_s : s, of the B-scans behind the poses
+    clip : part of each B-scan that is looked at; None for all of it
+    """
+    chosen, part = settings or tank_calibration.Settings(), Clip(*clip) if clip else Clip(0, 0, *sweep.size)
+    images: Iterable = watch.follow(sweep.images(), len(sweep.frames), "looking for the crossing")
+    return crossing_frames.look(
+        sweep.name,
+        (part.cut(image) for image in images),
+        sweep.size,
+        sweep.frames,
+        sweep.poses(lag_s),
+        sweep.pose_covariance(lag_s),
+        chosen.appearance,
+        part.corner,
+        chosen.phantom,
+    )
+
+
+def calibrate(
+    frames: CrossingFrames,
+    design: Probe,
+    settings: tank_calibration.Settings,
+    scanner_sy: float | None = None,
+    watch: Watch = SILENT,
+) -> CalibratedProbe:
+    """Calibrate the probe by the crossing in its frames.
+
+    Parameters
+    ----------
+    scanner_sy : mm/px in depth, as of `recon.probe_calibration.tank_calibration.calibrate`
+
+    Raises
+    ------
+    InputError
+        If the frames are too few, or don't determine the calibration.
+    """
+    crossing_frames.refuse_few(frames)
+    start = perf_counter()
+    result = tank_calibration.calibrate(frames, design, settings, scanner_sy)
+    seconds = {"seconds_calibrate": round(perf_counter() - start, 3)}
+    figures = probe_figures.measure(frames, result, design, settings)
+    for line in probe_figures.describe(frames, result, figures, design, settings):
+        watch.say(line)
+    return CalibratedProbe(frames, result, figures | seconds)
+
+
+def read(settings: Settings) -> SweepCapture | SequenceSweep:
+    """Open the sweep over the wires."""
+    if settings.capture is not None:
+        return sweep_part.read_sweep(settings.capture, settings.sweep, "probe", settings.implausible)
+    assert settings.sequence is not None
+    return sequence_sweep.read_sequence_sweep(
+        settings.sequence, settings.frame_names(FrameNames()), settings.tracker, settings.implausible
+    )
+
+
+def write(out: Path, found: CalibratedProbe, figures: Metrics) -> list[str]:
+    """Write all files, whole or not at all; returns their names."""
+    with atomic.new_folder(out, BY) as folder:
+        probe_files.write(folder / PROBE, found.result.calibration)
+        probe_files.write_authors(folder / probe_files.AUTHORS, found.result.calibration)
+        rows = probe_figures.rows(found.frames, found.result.adjustment)
+        sweep_tables.write_rows(folder / FRAMES, probe_figures.COLUMNS, rows)
+        metrics.write(folder / metrics.FILE, figures)
+    return [PROBE, probe_files.AUTHORS, FRAMES, metrics.FILE]

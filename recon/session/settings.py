@@ -1,0 +1,131 @@
+"""Settings that several steps share: each with its default, its bounds, its unit and its text, once."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationInfo, model_validator
+
+from recon.capture import target_files
+from recon.geometry.camera import Camera
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
+from recon.model.rig import NotNegative, Part, Probe, Rig, Target
+from recon.registry import Choice
+from recon.segmentation.blur_correction import MOST_MM, Blur
+from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
+from recon.tracking import networks
+from recon.tracking.tracker import Tracker
+
+Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
+OF_THE_SCALE = "rig.probe.scale_mm_per_px"
+
+
+class TrackingFields(Part):
+    """Fields of a step that tracks the target by cameras some time after their calibration."""
+
+    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
+    """px, standard deviation of principal points since the calibration: warmth, a turned mount; focal lengths by 4e-4 of it,
+    relative"""
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
+    less: of paper by moisture; 1e-5 of chrome on glass"""
+    networks: Path | None = None
+    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
+    naming: Literal["networks", "geometry"] = "networks"
+    """by which a circle gets its name: networks that were trained for this kind of target; or its place among the others alone,
+    with any networks: slower, and of covered circles fewer are found"""
+
+
+class TrackerFields(TrackingFields):
+    """Fields of a step that tracks the target by a tracker of its own."""
+
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design: distances and diameters of its circles, and their tolerance"""
+    calibration: Path | None = None
+    """file of the devices' calibration, used instead of the capture's own"""
+    threads: Annotated[int, Field(ge=0, le=1024)] = 0
+    """cores for the networks, 0 for all; another number may change last digits"""
+
+
+class TargetField(Part):
+    """The field of a step that tracks the target as it was measured, if it was."""
+
+    target: Path | None = None
+    """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
+
+
+class MeasuredTargetFields(TargetField, TrackerFields):
+    """Fields of a step that tracks the target as it was measured, by a tracker of its own."""
+
+
+def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
+    depths = [depth for depth, _ in value or ()]
+    if any(second <= first for first, second in pairwise(depths)):
+        raise ValueError(f"expected rising depths, found {depths}")
+    return value
+
+
+class EchoFields(Part):
+    """Fields of a step that corrects what it finds in B-scans for the extent of echoes."""
+
+    spread_mm: tuple[Spread, Spread] = SPREAD_MM
+    """mm, sigma of an echo's power along the array and in depth; both move a tube's bent wall, the first flattens masses'
+    lobes and blurs their shadows. These are the default array's. To measure them: the half-maximum width of a thin wire's
+    echo amplitude there, over 2.355 * sqrt(2)"""
+    slice_mm: Annotated[tuple[tuple[NotNegative, Spread], ...] | None, AfterValidator(_rising)] = SLICE_MM
+    """mm, depth and sigma of an echo's power across the image plane there, which flattens masses' lobes; these are the default
+    array's. To measure it: the half-maximum width, across the plane, of the echo amplitude of a thin wire or of an inclined
+    sheet (IEC 61391-1) at some depths, over 2.355 * sqrt(2). [] takes an infinitely thin slice, and null leaves lobes as
+    flat as they are found, and edges of shadows sharp"""
+
+    @property
+    def blur(self) -> Blur | None:
+        """Blur of the B-scans that masses are corrected for."""
+        return None if self.slice_mm is None else Blur(self.spread_mm[0], self.slice_mm)
+
+
+class ScaleFields(Part):
+    """The field of a step that reads rig.probe's scale, which counts otherwise where it was given."""
+
+    scale_given: bool = False
+    """whether rig.probe.scale_mm_per_px is the scanner's even where it is the usual rig's; true by itself where it is given"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _knows_what_was_given(cls, values: Any, info: ValidationInfo) -> Any:
+        names = {each.lstrip("+~").partition("=")[0] for each in (info.context or {}).get("overrides", ())}
+        given = names & {"rig", "rig.probe", OF_THE_SCALE} and isinstance(values, dict)
+        return {**values, "scale_given": True} if given else values
+
+    def scanner_sy(self, given: Probe, usual: Probe) -> float | None:
+        """The scanner's mm/px in depth: as given; NaN where only the size was, so of another scanner; None for the usual."""
+        if self.scale_given or given.scale_mm_per_px != usual.scale_mm_per_px:
+            return given.scale_mm_per_px[1]
+        return None if given.image_size == usual.image_size else np.nan
+
+
+def target_of(fields: MeasuredTargetFields) -> Target:
+    """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
+    design = fields.rig.target
+    return design if fields.target is None else target_files.read(fields.target, design)
+
+
+def make_tracker(
+    fields: TrackerFields, target: Target, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
+) -> Tracker:
+    """The tracker of a target, by cameras some time after their calibration.
+
+    Parameters
+    ----------
+    known : of the cameras' calibration; None where it has none
+    bits : of frames deeper than 8 bits; None of others
+
+    Raises
+    ------
+    InputError
+        If a network is missing, isn't one, or is of another kind of target.
+    """
+    folder, by_geometry = fields.networks or networks.WEIGHTS, fields.naming == "geometry"
+    loaded = networks.load(folder, fields.threads, target.kind, by_geometry)
+    return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)
