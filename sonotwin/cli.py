@@ -5,7 +5,6 @@ Exit status: 0 done, 2 a mistake of the user or of the installation (one line on
 SIGTERM, which schedulers send, or 129 by SIGHUP, which a closed terminal sends; all of these clean up first.
 """
 
-import ast
 import os
 import signal
 import sys
@@ -15,9 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
-from importlib.util import find_spec
 from io import TextIOWrapper
-from pathlib import Path
 
 from recon.errors import InputError
 
@@ -156,7 +153,9 @@ def _run(arguments: list[str]) -> int:
     verb = _find(arguments[0])
     overrides = arguments[1:]
     if "-h" in overrides or "--help" in overrides:
-        print(_help(verb))
+        from sonotwin import verb_help
+
+        print(verb_help.text(verb.name, verb.module))
         return 0
     for override in overrides:
         if override.startswith("-"):
@@ -179,29 +178,6 @@ def _find(name: str) -> Verb:
     close = get_close_matches(name, names, n=1)
     advice = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(names)}"
     raise InputError(f"{name}: unknown verb; {advice}")
-
-
-def _help(verb: Verb) -> str:
-    """Give the verb's docstring, its fields and the choices of its groups; a verb without fields isn't imported."""
-    spec = find_spec(verb.module)
-    if spec is None or spec.origin is None:
-        raise InputError(f"{verb.name}: this installation lacks {verb.module}")
-    module = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
-    text = ast.get_docstring(module) or verb.summary
-    parts = [f"usage: sonotwin {verb.name} [field=value ...]", text]
-    settings = next((node for node in module.body if isinstance(node, ast.ClassDef) and node.name == "Config"), None)
-    if settings is not None and not any(isinstance(node, ast.AnnAssign) for node in settings.body):
-        return "\n\n".join(parts)
-    from recon import interrupts
-    from sonotwin import config
-
-    with interrupts.held_back():  # while the verb is imported
-        shown = config.shown(verb.name)
-    parts.append("fields:\n\n" + "\n".join(f"  {line}".rstrip() for line in shown.splitlines()))
-    choices = config.groups(verb.name)
-    if choices:
-        parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))
-    return "\n\n".join(parts)
 
 
 def _complain(message: str, status: int = 2) -> int:

@@ -21,6 +21,7 @@ SEGMENTS_MM = np.array([[46, 27, 22], [50, 31, 23], [46, 28, 23], [36, 21, 20]],
 RADII_MM = np.array([9.2, 9.4, 8.8, 7.8])  # of the fingers at their roots
 THUMB_MM = np.array([34.0, 28.0])
 SPACING_MM = 20.0  # between neighbouring knuckles
+DEGREES = np.linspace(0, 2 * np.pi, 361)[:-1]  # a round, rad
 STUMP_MM = 70.0  # of the forearm that belongs to the skin's field; the rest is a tapered tube
 
 
@@ -72,6 +73,7 @@ def gripping(rng: np.random.Generator, outline: Array, left: bool, turn: float) 
     cos, sin = np.cos(turn), np.sin(turn)
     to_rod = np.array([[cos, -sin * sign], [sin, cos * sign]])  # palm's frame (out of the palm's back, to the knuckles)
     around = outline @ to_rod
+    rod = _round(around)
     heights = (1.5 - np.arange(4)) * SPACING_MM * size * spread * np.array([0.95, 1, 1, 1])
 
     bones, knuckles = [], []
@@ -82,14 +84,14 @@ def gripping(rng: np.random.Generator, outline: Array, left: bool, turn: float) 
         radius = RADII_MM[k] * size
         away = radius + slack * rng.uniform(0.3, 1) + np.array([8.5, 6, 3.5, 1]) * size
         lengths = SEGMENTS_MM[k] * size * rng.uniform(0.93, 1.03)
-        chain = _walk(around, away, start_angle + rng.normal(0, 0.05), lengths, 1)
+        chain = _walk(rod, away, start_angle + rng.normal(0, 0.05), lengths, 1)
         drop = slope * np.linspace(0, 80, 4) + rng.normal(0, 1.5, 4) * [0, 1, 1, 1]
         joints = np.column_stack([chain, heights[k] + drop])
         knuckles.append(joints[0])
         bones += _finger(joints, radius)
     thumb_radius = 10.5 * size
     away = thumb_radius + slack + np.array([6.5, 4.5, 1]) * size
-    chain = _walk(around, away, -rng.uniform(0.9, 1.3), THUMB_MM * size, -1)
+    chain = _walk(rod, away, -rng.uniform(0.9, 1.3), THUMB_MM * size, -1)
     joints = np.column_stack([chain, heights[0] + np.array([-8, 4, 9])])
     joints[:, 2] += rng.uniform(-6, 14)
     root = wrist + np.array([-6, 10, 14 * size])
@@ -284,29 +286,40 @@ def _smooth_minimum(a: NDArray[np.float32], b: NDArray[np.float32], width: float
     return np.minimum(a, b) - near**2 * np.float32(width / 4)
 
 
-def _offset(outline: Array, distance: float) -> Array:
-    """A convex outline : (n, 2) grown by a distance, by its support function, at 180 directions."""
+@dataclass(frozen=True, eq=False)
+class _Round:
+    """A convex outline by its support: of each of 180 directions the outline's farthest point."""
+
+    farthest: Array  # (180, 2), mm
+    normals: Array  # (180, 2), unit
+
+    def at(self, distance: float) -> Array:
+        """The outline grown by a distance : (180, 2) mm."""
+        return self.farthest + distance * self.normals
+
+
+def _round(outline: Array) -> _Round:
     turn = 2 * np.pi * np.arange(180) / 180
     normals = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    return outline[(outline @ normals.T).argmax(axis=0)] + distance * normals
+    return _Round(outline[(outline @ normals.T).argmax(axis=0)], normals)
 
 
 def _support(outline: Array, angle: float) -> float:
     return float((outline @ [np.cos(angle), np.sin(angle)]).max())
 
 
-def _walk(outline: Array, distances: Array, start: float, lengths: Array, way: int) -> Array:
-    """Joints : (k + 1, 2) around a convex outline : (n, 2), each a segment's length on from the last.
+def _walk(outline: _Round, distances: Array, start: float, lengths: Array, way: int) -> Array:
+    """Joints : (k + 1, 2) around a convex outline, each a segment's length on from the last.
 
     distances : (k + 1,) mm, of the joints from the outline: a segment between two of them bulges away less than they stand off.
     """
-    turn = start + way * np.linspace(0, 2 * np.pi, 361)[:-1]
+    turn = start + way * DEGREES
+    ways = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     joints, first = [], 0
     for k, distance in enumerate(distances):
-        contour = _offset(outline, distance)
+        contour = outline.at(distance)
         angle = np.arctan2(contour[:, 1], contour[:, 0])
-        radius = np.interp(turn, angle[np.argsort(angle)], np.hypot(*contour.T)[np.argsort(angle)], period=2 * np.pi)
-        points = radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        points = np.interp(turn, angle, np.hypot(*contour.T), period=2 * np.pi)[:, None] * ways
         if k:
             far = np.flatnonzero(np.linalg.norm(points[first:] - joints[-1], axis=1) >= lengths[k - 1])
             first = first + int(far[0]) if len(far) else 359

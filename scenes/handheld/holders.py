@@ -40,7 +40,7 @@ def grip(
         skeleton = hands.turned(closed, to_grip[:3, :3], to_grip[:3, 3])
         arm = skeleton.wrist + np.linspace(0, 300, 20)[:, None] * skeleton.forearm
         balls = np.concatenate([skeleton.points(), np.column_stack([arm, np.full(20, 45.0)])])
-        if not refused(balls) and skeleton.forearm[2] < 0.75:
+        if skeleton.forearm[2] < 0.75 and not refused(balls):
             return hands.clothed(rng, skeleton)
     return []
 

@@ -4,6 +4,7 @@ Body frame: z along the probe from the array's face at z = 0 to the back, x alon
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +31,13 @@ class Body:
     exponent: float
     neck: float  # mm, radius of the back where the cable leaves
 
+    @cached_property
+    def _halves(self) -> PchipInterpolator:
+        return PchipInterpolator(self.levels, self.half)
+
     def outline_at(self, part: float) -> Array:
         """The cross-section : (SIDES, 3) mm at a fraction of the length, about the axis, z = 0."""
-        half = PchipInterpolator(self.levels, self.half)(np.clip(part, 0.02, 0.98))
+        half = self._halves(np.clip(part, 0.02, 0.98))
         return np.column_stack([lofts.superellipse(half, self.exponent, SIDES), np.zeros(SIDES)])
 
 

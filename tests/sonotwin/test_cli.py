@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from recon import user_cache
 from recon.errors import InputError
-from sonotwin import cli
+from sonotwin import cli, verb_help
 
 VERBS = sorted(path.stem.replace("_", "-") for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
 
@@ -47,21 +48,65 @@ def test_help_lists_verbs_in_order(capsys):
     assert [line[0] for line in lines if line[0] != "or"][-len(cli.VERBS) :] == [verb.name for verb in cli.VERBS]
 
 
+@pytest.fixture
+def no_texts(tmp_path, monkeypatch):
+    """A folder without any text of help."""
+    monkeypatch.setattr(user_cache, "help_texts", lambda: tmp_path / "help")
+    return tmp_path / "help"
+
+
 @pytest.mark.parametrize("verb", VERBS)
-def test_help_of_a_verb(verb, capsys):
-    """It comes within seconds, shows an example that can be typed, and each field with its default."""
+def test_help_of_a_verb(verb, no_texts, monkeypatch, capsys):
+    """It shows an example that can be typed, and each field with its default; the second time, without the verb."""
     assert cli.main([verb, "--help"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(f"usage: sonotwin {verb}")
     assert f"    sonotwin {verb}" in text
+    monkeypatch.setattr(verb_help, "make", None)
+    assert cli.main([verb, "--help"]) == 0
+    assert capsys.readouterr().out == text
+
+
+def test_help_is_made_anew_after_a_change_and_where_nothing_can_be_kept(no_texts, monkeypatch):
+    """One file a verb is kept, whatever became of the last one."""
+    made = iter(("first", "second", "third", "fourth"))
+    monkeypatch.setattr(verb_help, "make", lambda verb, module: next(made))
+    monkeypatch.setattr(verb_help, "_state", lambda: "one state")
+    assert [verb_help.text("check", "") for _ in range(2)] == ["first", "first"]
+    monkeypatch.setattr(verb_help, "_state", lambda: "another")
+    assert [verb_help.text("check", "") for _ in range(2)] == ["second", "second"]
+    (no_texts / "check.txt").write_bytes(b"\xff")
+    assert verb_help.text("check", "") == "third" and [file.name for file in no_texts.iterdir()] == ["check.txt"]
+    (no_texts / "check.txt").unlink()
+    no_texts.rmdir()
+    no_texts.write_text("a file in its place")
+    assert verb_help.text("check", "") == "fourth"
+
+
+def test_the_state_is_that_of_all_sources(tmp_path, monkeypatch):
+    """Of a wheel, too, which has conf inside the package."""
+    for name in ("sonotwin/cli.py", "sonotwin/conf/rig/one.yaml", "recon/a.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("a")
+    monkeypatch.setattr(verb_help, "__file__", str(tmp_path / "sonotwin" / "verb_help.py"))
+    states = [verb_help._state()]
+    for name in ("recon/a.py", "sonotwin/conf/rig/one.yaml", "twin/new.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("longer")
+        states.append(verb_help._state())
+    (tmp_path / "recon" / "__pycache__").mkdir()
+    (tmp_path / "recon" / "__pycache__" / "a.py").write_text("")
+    assert len(set(states)) == 4 and verb_help._state() == states[-1]
 
 
 def test_help_waits_for_no_library():
-    """It is there at once, 0.05 s, because nothing heavy is imported for it."""
+    """It is there at once because nothing heavy is imported for it; a verb's likewise, once it is kept."""
     heavy = {"numpy", "scipy", "cv2", "numba", "hydra", "drjit", "mitsuba", "torch", "onnxruntime", "matplotlib", "trimesh"}
-    code = "import sys; from sonotwin.cli import main; main(['--help']); print(*sys.modules, file=sys.stderr)"
+    assert cli.main(["check", "--help"]) == 0
+    asked = "main(['--help']); main(['check', '--help'])"
+    code = f"import sys; from sonotwin.cli import main; {asked}; print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "usage: sonotwin" in done.stdout
+    assert done.stdout.count("usage: sonotwin") == 2
     assert not heavy & set(done.stderr.split())
 
 
@@ -140,7 +185,7 @@ def test_a_command_that_is_told_to_end_cleans_up(tmp_path, number, status):
 import os, signal, sys, time
 from pathlib import Path
 from recon.files import atomic
-from sonotwin import cli
+from sonotwin import cli, verb_help
 
 def work(arguments):
     with atomic.new_folder(Path("out"), "mark"):

@@ -1,0 +1,94 @@
+"""The text of `sonotwin VERB --help`: its docstring, fields with defaults, units and texts, and choices.
+
+Fields are those of the verb's `Config`, which takes seconds to import with all that the verb calculates with. So the text is kept
+beside the compiled code, by the state of all source files, and comes at once the next time.
+"""
+
+import ast
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+
+from recon import user_cache
+from recon.errors import InputError
+
+PACKAGES = ("recon", "scenes", "twin", "trainers", "sonotwin", "conf")  # whose files a text may depend on
+
+
+def text(verb: str, module: str) -> str:
+    """The help of a verb, which is in `module`; as it was kept, if no file has changed since.
+
+    Raises
+    ------
+    InputError
+        If the installation lacks the module.
+    """
+    place, state = user_cache.help_texts() / f"{verb}.txt", _state()
+    try:
+        first, _, kept = place.read_text(encoding="utf-8").partition("\n")
+        if first == state:
+            return kept
+    except (OSError, ValueError):
+        pass  # none yet
+    made = make(verb, module)
+    _keep(place, f"{state}\n{made}")
+    return made
+
+
+def make(verb: str, module: str) -> str:
+    """The help of a verb from its module; one without fields isn't imported."""
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        raise InputError(f"{verb}: this installation lacks {module}")
+    source = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    parts = [f"usage: sonotwin {verb} [field=value ...]", ast.get_docstring(source) or ""]
+    settings = next((node for node in source.body if isinstance(node, ast.ClassDef) and node.name == "Config"), None)
+    if settings is not None and not any(isinstance(node, ast.AnnAssign) for node in settings.body):
+        return "\n\n".join(parts)
+    from recon import interrupts
+    from sonotwin import config
+
+    with interrupts.held_back():  # while the verb is imported
+        shown = config.shown(verb)
+    parts.append("fields:\n\n" + "\n".join(f"  {line}".rstrip() for line in shown.splitlines()))
+    choices = config.groups(verb)
+    if choices:
+        parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))
+    return "\n\n".join(parts)
+
+
+def _keep(place: Path, content: str) -> None:
+    """Write a file as a whole; a cache that can't be written is none."""
+    temporary = place.with_name(f".{place.stem}.{os.getpid()}")
+    with suppress(OSError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(content, encoding="utf-8")
+        temporary.replace(place)
+
+
+def _state() -> str:
+    """Digest of names, sizes and times of all files that a text may depend on; to read them would take as long as the imports."""
+    root, found = Path(__file__).resolve().parent, hashlib.sha256()
+    for package in PACKAGES:
+        for folder in (root.parent / package, root / package):  # conf is beside the package in a clone, inside it in a wheel
+            for line in sorted(_files(folder)):
+                found.update(line.encode("utf-8", "surrogateescape"))
+    return found.hexdigest()
+
+
+def _files(folder: Path) -> Iterator[str]:
+    try:
+        entries = list(os.scandir(folder))
+    except OSError:
+        return
+    for entry in entries:
+        if entry.name.startswith((".", "__pycache__")):
+            continue
+        if entry.is_dir():
+            yield from _files(Path(entry.path))
+        elif entry.name.endswith((".py", ".yaml")):
+            about = entry.stat()
+            yield f"{entry.path} {about.st_size} {about.st_mtime_ns}\n"
