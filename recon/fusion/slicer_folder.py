@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
 import trimesh
 
 from recon.files import meshes, volumes
@@ -81,10 +80,18 @@ def write_transform(path: Path, world_from_target: np.ndarray) -> None:
     3D Slicer reads such a file as the transform of a node to its parent's frame, by its inverse.
     """
     inverse = rigid.invert(world_from_target)
-    transform = sitk.AffineTransform(3)
-    transform.SetMatrix(inverse[:3, :3].ravel().tolist())
-    transform.SetTranslation(inverse[:3, 3].tolist())
-    sitk.WriteTransform(transform, str(path))
+    numbers = " ".join(_itk_number(value) for value in (*inverse[:3, :3].ravel(), *inverse[:3, 3]))
+    header = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    path.write_text(f"{header}Parameters: {numbers}\nFixedParameters: 0 0 0\n", encoding="ascii", newline="\n")
+
+
+def _itk_number(value: float) -> str:
+    """The shortest text that is read back as the same number, in the form that ITK writes."""
+    if value == 0:
+        return "0"
+    if abs(value) < 1e-6:
+        return np.format_float_scientific(value, trim="-", exp_digits=1)
+    return np.format_float_positional(value, trim="-")
 
 
 def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
