@@ -17,7 +17,6 @@ from recon.devices.pattern_player import Pattern, Stage
 from recon.model.patterns import Patterns
 
 STILL = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
-GRAIN_PX = 8  # blocks whose means are compared, so that noise counts little
 
 
 @dataclass(frozen=True)
@@ -82,5 +81,6 @@ def changed(before: NDArray, after: NDArray) -> float:
 
 
 def _blocks(image: NDArray) -> NDArray[np.float64]:
-    height, width = (side - side % GRAIN_PX for side in image.shape)
-    return image[:height, :width].reshape(height // GRAIN_PX, GRAIN_PX, width // GRAIN_PX, GRAIN_PX).mean(axis=(1, 3))
+    grain_px = 8  # blocks whose means are compared, so that noise counts little
+    height, width = (side - side % grain_px for side in image.shape)
+    return image[:height, :width].reshape(height // grain_px, grain_px, width // grain_px, grain_px).mean(axis=(1, 3))

@@ -21,7 +21,6 @@ from recon.optical_calibration.sightings import Sighting
 LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
 BLURRED_PX = 3.0  # standard deviation, in the softest direction
 SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
-MOVED_PX = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
 
 
 @dataclass(frozen=True)
@@ -98,11 +97,12 @@ def _later_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
     sighting = observation.sighting
     if PROJECTOR in so_far.sizes and PROJECTOR not in sighting.pixels:
         yield _not_found(PROJECTOR, sighting)
+    moved_px = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
     for device, pixels in observation.again.items():
         away = np.linalg.norm(pixels - sighting.pixels[device], axis=1)
         if np.isnan(away).all():
             yield f"{device}: the board was out of sight after the last frame; rest it on something, until all is taken"
-        elif (moved := float(np.nanmedian(away))) > MOVED_PX:
+        elif (moved := float(np.nanmedian(away))) > moved_px:
             yield f"{device}: the board moved by {moved:.2f} px between the first frame and the last; rest it on something"
 
 

@@ -43,8 +43,6 @@ AS_NPZ = f"give it as {AUTHORS} with sx, sy, T_I_T and"  # a plain matrix, for w
 MOST_ROWS = 1e5  # of a scanner's image
 PLUS_ENDS = ("Image", "Probe")
 SEPARATORS = bytes.maketrans(b",;[]()", b"      ")
-RIGID_SCALE = 1e-6  # by which the axes of a rigid transform are off a length of 1
-MOST_OFF_DEG = 0.1  # of an image's axes, before it is said
 
 
 def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
@@ -96,14 +94,16 @@ def _of_matrix(path: Path, name: str, matrix: Array, speed_m_s: float | None) ->
         raise InputError(
             f"{path}: {name}: expected 4x4 finite numbers with a last row of 0 0 0 1, from pixels to mm, found others"
         )
-    if np.abs(scale - 1).max() < RIGID_SCALE:
+    rigid_scale = 1e-6  # by which the axes of a rigid transform are off a length of 1
+    if np.abs(scale - 1).max() < rigid_scale:
         expected = "first columns as long as the mm of a pixel"
         raise InputError(f"{path}: {name}: expected {expected}, found a rigid transform: multiply them by sx and sy in mm/px")
     if found := lengths.axes_fault(matrix):
         raise InputError(f"{path}: {name}: expected an image with square axes, found {found}")
     across, down = (matrix[:3, :2] / scale).T
     pose = rigid.nearest(rigid.transform(np.column_stack([across, down, np.cross(across, down)]), matrix[:3, 3]))
-    if (off := np.degrees(abs(np.arcsin(across @ down)))) > MOST_OFF_DEG:
+    most_off_deg = 0.1  # of an image's axes, before it is said
+    if (off := np.degrees(abs(np.arcsin(across @ down)))) > most_off_deg:
         log.warning(
             "%s: %s: axes are %.1f degrees off a right angle, and are taken as square; `config` keeps them", path, name, off
         )

@@ -31,7 +31,6 @@ from recon.files.regular import check_there, opened
 Dataset = Any
 Result = TypeVar("Result")
 
-MOST_FRAMES = 1_000_000
 MOST_BYTES = 1 << 33
 MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
 PREAMBLE, PREFIX = 128, b"DICM"
@@ -66,7 +65,8 @@ def _clip(path: Path) -> Clip:
     header = _dataset(path, stop_before_pixels=True)
     check_compression(path, header.file_meta.get("TransferSyntaxUID"))
     count = int(header.get("NumberOfFrames") or 1)
-    if not 1 <= count <= MOST_FRAMES:
+    most_frames = 1_000_000
+    if not 1 <= count <= most_frames:
         raise ValueError(f"NumberOfFrames {count}")
     size = int(header.Columns), int(header.Rows)
     if not 0 < size[0] * size[1] <= MOST_PX:

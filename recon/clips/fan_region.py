@@ -14,17 +14,10 @@ Array = NDArray[np.float64]
 
 EXPECTED = "expected a part between two sides and two arcs that changes from frame to frame"
 FIELD = "fan=[u,v,first,last,left,right]"
-LEAST_DEG = 5.0  # between the sides
-LEAST_ROWS = 20  # of a side
-TRIED_ROWS = 60  # of a side, through each two of which a line is laid
-NEAR_PX = 2.0  # of a side
-STRAIGHT = 0.5  # share of a side's rows near its line
-RINGING_DN = 8.0  # of the face, in the mean over time
 STIRS_DN = 0.3  # standard deviation over time, of what is dark but no border
 WITHIN = 0.9  # share of the changing part in the fan
 COVERED = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
 EDGE_PX = 12  # of the image, within which an arc may be cut off
-BINS = 60  # of directions, in each of which the fan's first and last radius are taken
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
@@ -48,7 +41,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         raise InputError(f"{name}: {expected}, found one without straight sides")
     (slope, start), (mirrored, end) = (side for side in sides if side is not None)
     left_deg, right_deg = np.rad2deg(np.arctan([slope, -mirrored]))
-    if right_deg - left_deg <= LEAST_DEG or max(-left_deg, right_deg) > STEEPEST_DEG:
+    least_deg = 5.0  # between the sides
+    if right_deg - left_deg <= least_deg or max(-left_deg, right_deg) > STEEPEST_DEG:
         raise InputError(f"{name}: {expected}, found sides at {left_deg:.0f} and {right_deg:.0f} deg")
     v = (start + end) / -(slope + mirrored)
     u = start + slope * v
@@ -65,7 +59,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
 
 def _face(mean: NDArray[np.float32], before: Fan) -> float:
     """Radius at which the face's ringing begins in the mean image, before the arc where changes do; there, if nothing rings."""
-    ringing = np.flatnonzero(_shares(mean > RINGING_DN, before) > 0.5)
+    ringing_dn = 8.0  # of the face, in the mean over time
+    ringing = np.flatnonzero(_shares(mean > ringing_dn, before) > 0.5)
     return float(ringing[0]) if ringing.size else before.last_px
 
 
@@ -90,15 +85,19 @@ def _side(rows: NDArray[np.int64], outermost: Array) -> tuple[float, float] | No
     Rows where the side is dark lie within it, be they as many as half of them.
     """
     count = int(outermost.argmin()) + 1
-    if count < LEAST_ROWS:
+    least_rows = 20  # of a side
+    if count < least_rows:
         return None
     rows, outermost = rows[:count], outermost[:count]
-    tried = np.linspace(0, count - 1, min(TRIED_ROWS, count)).astype(int)
+    tried_rows = 60  # of a side, through each two of which a line is laid
+    tried = np.linspace(0, count - 1, min(tried_rows, count)).astype(int)
     one, other = tried[np.transpose(np.triu_indices(len(tried), 1))].T
     slopes = (outermost[other] - outermost[one]) / (rows[other] - rows[one])
-    near = np.abs(outermost - outermost[one, None] - slopes[:, None] * (rows - rows[one, None])) < NEAR_PX
+    near_px = 2.0  # of a side
+    near = np.abs(outermost - outermost[one, None] - slopes[:, None] * (rows - rows[one, None])) < near_px
     most = near[near.sum(axis=1).argmax()]
-    if most.mean() < STRAIGHT:
+    straight = 0.5  # share of a side's rows near its line
+    if most.mean() < straight:
         return None
     start, slope = np.polynomial.polynomial.polyfit(rows[most], outermost[most], 1)
     return float(slope), float(start)
@@ -108,7 +107,8 @@ def _radii(part: Mask, u: float, v: float) -> tuple[float, float]:
     """Radii of both arcs: the medians over directions of the first and the last pixel, where the image doesn't end before."""
     y, x = np.nonzero(part)
     radius, angle = np.hypot(x - u, y - v), np.arctan2(x - u, y - v)
-    place = np.digitize(angle, np.linspace(*np.quantile(angle, [0.02, 0.98]), BINS))
+    bins = 60  # of directions, in each of which the fan's first and last radius are taken
+    place = np.digitize(angle, np.linspace(*np.quantile(angle, [0.02, 0.98]), bins))
     ends = np.array([np.quantile(radius[place == k], [0.002, 0.998]) for k in np.unique(place)[1:-1]])
     directions = np.array([angle[place == k].mean() for k in np.unique(place)[1:-1]])
     across, down = u + np.sin(directions) * ends[:, 1], v + np.cos(directions) * ends[:, 1]

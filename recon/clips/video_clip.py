@@ -13,8 +13,6 @@ from recon.errors import InputError
 from recon.files import video_file
 from recon.files.regular import check_there
 
-LEAST_STEP_S = 1e-6  # between frames' time stamps; without them all are 0
-
 
 def read(path: Path) -> Clip:
     """Open a video; its time stamps are those of its frames, or even by its rate where it has none.
@@ -30,7 +28,8 @@ def read(path: Path) -> Clip:
         raise InputError(f"{path}: expected a video, found none that OpenCV can read")
     stamps, sizes, rates = zip(*frames, strict=True)
     seconds, rate = np.array(stamps), rates[0]
-    if len(seconds) > 1 and np.diff(seconds).min() < LEAST_STEP_S:
+    least_step_s = 1e-6  # between frames' time stamps; without them all are 0
+    if len(seconds) > 1 and np.diff(seconds).min() < least_step_s:
         seconds = np.arange(len(seconds)) / rate if rate > 0 else None
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, sizes[0], len(frames), timed, lambda: _images(path))

@@ -15,7 +15,6 @@ from recon.devices.interfaces import Image
 Pattern = NDArray[np.uint8]
 
 FULL = 255.0  # level of a pattern
-TELLING = 1.0  # times the noise that a change must be for a verdict
 
 
 class Light(NamedTuple):
@@ -46,7 +45,8 @@ def change(light: Light, images: tuple[Image, Image], patterns: tuple[Pattern, P
         where the patterns differ too little for this light.
     """
     expected = light.power * _mean_square(*patterns) / FULL**2
-    if expected <= TELLING * light.noise:
+    telling = 1.0  # times the noise that a change must be for a verdict
+    if expected <= telling * light.noise:
         return np.nan
     return max(_mean_square(*images) - light.noise, 0.0) / expected
 

@@ -25,7 +25,6 @@ from recon.files.regular import read_bytes
 Array = NDArray[np.float64]
 
 MOST_BYTES = 1 << 33  # of all voxels, and of a file of them
-LARGEST_VOXEL = 8  # bytes
 FARTHEST_MM = 1e9
 META_NAMES = {np.dtype(code): name for name, code in medical_images.META_TYPES.items()}
 NRRD_NAMES = {dtype: {"f4": "float", "f8": "double"}.get(dtype.str[1:], dtype.name) for dtype in META_NAMES}
@@ -135,9 +134,10 @@ def _nrrd_content(path: Path) -> tuple[NDArray, nrrd.NRRDHeader]:
     if detached is not None:
         medical_images.check_beside(path, path.parent / detached)
         stream = io.BytesIO(read_bytes(path.parent / detached, MOST_BYTES))
-    most = LARGEST_VOXEL * math.prod(map(int, header["sizes"])) + 1
+    largest_voxel = 8  # bytes
+    most = largest_voxel * math.prod(map(int, header["sizes"])) + 1
     if not 1 < most <= MOST_BYTES:
-        raise fault(path, "sizes", f"numbers of voxels, up to {MOST_BYTES // LARGEST_VOXEL} in all", header["sizes"])
+        raise fault(path, "sizes", f"numbers of voxels, up to {MOST_BYTES // largest_voxel} in all", header["sizes"])
     lines = header.pop("line skip", header.pop("lineskip", 0))
     for _ in range(lines):
         if not stream.readline():

@@ -48,7 +48,6 @@ class Addition:
 
 Files = dict[str, tuple[Written, ...]]  # by path within the folder; two of a file that is being replaced where it stands
 _known: dict[tuple[int, ...], str] = {}  # digests by device, inode, size and times: files are read once a process
-RESTED_NS = 2_000_000_000  # after which a file's times tell one change from the next
 
 
 def read_list(folder: Path) -> Files | None:
@@ -120,7 +119,8 @@ def _sha256(path: Path) -> str:
         if key in _known:
             return _known[key]
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if abs(time.time_ns() - max(there.st_mtime_ns, there.st_ctime_ns)) > RESTED_NS:
+    rested_ns = 2_000_000_000  # after which a file's times tell one change from the next
+    if abs(time.time_ns() - max(there.st_mtime_ns, there.st_ctime_ns)) > rested_ns:
         _known[key] = digest
     return digest
 

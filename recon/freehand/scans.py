@@ -56,8 +56,6 @@ class Unsure(NamedTuple):
 
 
 ASSUMED = Unsure(0.1, 50.0)  # of a lag that is taken as none: scanners show images 0 to 200 ms late; and of any tissue's sound
-SOFT_M_S = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
-KNOWN_TISSUE_M_S = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
 
 
 class ScansFields(SequenceFields):
@@ -109,7 +107,8 @@ class ScansFields(SequenceFields):
     def unsure(self) -> Unsure:
         """Standard deviations, wider of what isn't given but assumed."""
         lag = self.lag_sigma_s if self.lag_sigma_s is not None else ASSUMED.lag_s if self._lag_assumed else 0.0
-        known = ASSUMED.tissue_m_s if self.tissue_m_s is None else KNOWN_TISSUE_M_S
+        known_tissue_m_s = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
+        known = ASSUMED.tissue_m_s if self.tissue_m_s is None else known_tissue_m_s
         return Unsure(lag, known if self.tissue_sigma_m_s is None else self.tissue_sigma_m_s)
 
     @property
@@ -330,9 +329,10 @@ def cautions(scans: Scans) -> Iterator[str]:
         yield line
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
-    if not SOFT_M_S[0] <= scans.speed_m_s <= SOFT_M_S[1]:
+    soft_m_s = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
+    if not soft_m_s[0] <= scans.speed_m_s <= soft_m_s[1]:
         found = f"sound of {scans.speed_m_s:g} m/s in all that was scanned"
-        yield f"{found}: of bone or gas? Soft tissues, water and silicone have {SOFT_M_S[0]:g} to {SOFT_M_S[1]:g} m/s"
+        yield f"{found}: of bone or gas? Soft tissues, water and silicone have {soft_m_s[0]:g} to {soft_m_s[1]:g} m/s"
     yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 

@@ -55,7 +55,6 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     ),
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
-MOST_EMPTY, FEW_FRAMES = 10, 10_000  # times the fields that are there, which all frames may lack; frames of a file without any
 FARTHEST_MM, MOST_SECONDS = 1e7, 9e9  # of a matrix; of a time stamp, that nanoseconds of 64 bits can hold
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
 RAS, LPS = "RAS", "LPS"
@@ -276,7 +275,9 @@ def _without_images(file: ImageFile) -> Frames:
 def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
     table: dict[str, list[str]] = {}
     names = {match[2] for name in file.fields if (match := FRAME_FIELD.fullmatch(name))}
-    if (len(names) + 1) * count > MOST_EMPTY * (len(file.fields) + FEW_FRAMES):
+    # times the fields that are there, which all frames may lack; frames of a file without any
+    most_empty, few_frames = 10, 10_000
+    if (len(names) + 1) * count > most_empty * (len(file.fields) + few_frames):
         raise file.fault("DimSize", f"frames of which most have fields, as {len(file.fields)} are there", f"{count} frames")
     for name, text in file.fields.items():
         if match := FRAME_FIELD.fullmatch(name):

@@ -22,8 +22,6 @@ SKIN, TABLE, MASS = (224, 187, 165, 150), (120, 105, 90, 255), (200, 60, 60, 255
 PATH, DEVICE, BODY, INK = (60, 140, 220, 255), (90, 90, 90, 255), (235, 235, 235, 255), (20, 20, 20, 255)
 GREY_SKIN, GREY_TABLE = (255, 240, 230, 170), (255, 255, 255, 255)  # over which the surface's own grey is laid
 STEP_MM = 1.0  # of the surfaces' vertices, which are merged to that
-PATH_MM = 0.6  # radius of the path's tube
-DEVICE_MM = 40.0  # length of a device's pyramid
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +93,8 @@ def path_layer(places: Array) -> trimesh.Trimesh:
     """A tube along places : (n, 3) mm, n >= 2; where two coincide there is no piece."""
     moved = np.linalg.norm(np.diff(places, axis=0), axis=1) > 1e-6
     ends = zip(places[:-1][moved], places[1:][moved], strict=True)
-    pieces = [trimesh.creation.cylinder(PATH_MM, segment=both, sections=6) for both in ends]
+    path_mm = 0.6  # radius of the path's tube
+    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends]
     whole = trimesh.util.concatenate(pieces)
     assert isinstance(whole, trimesh.Trimesh)
     return painted(whole, PATH)
@@ -105,7 +104,8 @@ def device_layer(camera: Camera) -> trimesh.Trimesh:
     """A camera or the projector as a pyramid: its centre, and its view some centimetres away."""
     width, height = camera.size
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
-    vertices = np.vstack([camera.centre, camera.centre + DEVICE_MM * camera.rays(corners)])
+    device_mm = 40.0  # length of a device's pyramid
+    vertices = np.vstack([camera.centre, camera.centre + device_mm * camera.rays(corners)])
     faces = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]]
     return painted(trimesh.Trimesh(vertices, faces, process=False), DEVICE)
 

@@ -12,7 +12,6 @@ from recon.navigation.publishing import StillScene
 from recon.segmentation import containment, mass_files
 
 STEP_MM = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
-LEAST_SIDED = 0.01  # of a skin's area, by which more of it looks away than towards camera 1, to be turned
 
 
 def read_scene(
@@ -55,7 +54,8 @@ def outside_out(skin: trimesh.Trimesh) -> trimesh.Trimesh:
     """
     areas = np.asarray(skin.area_faces)
     away = areas @ np.asarray(skin.face_normals) @ (skin.centroid / np.linalg.norm(skin.centroid))
-    if away <= LEAST_SIDED * areas.sum():
+    least_sided = 0.01  # of a skin's area, by which more of it looks away than towards camera 1, to be turned
+    if away <= least_sided * areas.sum():
         return skin
     turned = skin.copy()
     turned.invert()

@@ -19,9 +19,6 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.5  # standard deviation; lobes of the blurred borders are wider
-MESH_MM = 0.5  # between vertices
-LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
 NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
 FAR_MM = 5.0  # around a mass, to which distances reach
@@ -50,10 +47,13 @@ def evened(mass: Mass, axes: Array) -> Mass:
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
     Its vertices are `MESH_MM` apart along the axes : (3, 3), columns.
     """
-    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, MESH_MM), NEAR_MM + 3 * EVEN_MM))
-    field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / MESH_MM), 3 * (slice(0, None),)
+    even_mm = 0.5  # standard deviation; lobes of the blurred borders are wider
+    mesh_mm = 0.5  # between vertices
+    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, mesh_mm), NEAR_MM + 3 * even_mm))
+    field, whole = ndimage.gaussian_filter(near.voxels, even_mm / mesh_mm), 3 * (slice(0, None),)
     level, volume = 0.0, enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
-    for _ in range(LEVELLINGS):
+    levellings = 4  # Newton's steps to the level that holds the volume
+    for _ in range(levellings):
         mesh = meshed(field, level, whole, near, outside=FAR_MM)
         level += (volume - enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
     return Mass(meshed(field, level, whole, near, outside=FAR_MM))

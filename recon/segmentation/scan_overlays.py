@@ -10,7 +10,6 @@ Overlay = NDArray[np.uint8]  # (h, w, 3), blue, green, red
 Mask = NDArray[np.bool_]
 
 LEAST_PX = 30  # of a mass in a B-scan that is drawn
-SLIT_PX = 7  # width of slits and spikes that are not drawn
 COLOUR = (60, 220, 255)  # of outlines, blue, green, red
 
 
@@ -44,7 +43,8 @@ def drawn_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bo
 
 def _contours(mask: Mask) -> list[NDArray]:
     """Borders of a mask, without the slits that neighbouring lines leave which a flank bends differently."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SLIT_PX, SLIT_PX))
-    padded = np.pad(mask.astype(np.uint8), SLIT_PX)
+    slit_px = 7  # width of slits and spikes that are not drawn
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (slit_px, slit_px))
+    padded = np.pad(mask.astype(np.uint8), slit_px)
     whole = cv2.morphologyEx(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc), cv2.MORPH_OPEN, disc)
-    return [line[:, 0] - SLIT_PX for line in cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
+    return [line[:, 0] - slit_px for line in cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]

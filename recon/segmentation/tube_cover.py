@@ -23,8 +23,6 @@ MOST_POINTS = 100_000  # evenly chosen; more would change the radius by less tha
 OUTLIER = 4.0  # standard deviations, by the median absolute deviation
 ROUNDS = 3
 LEAST_ARC_DEG = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
-MOST_TURN_DEG = 20.0  # between both axes
-MOST_RMS_MM = 0.3  # of the points about the cylinder: light is ten times as exact
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
         raise InputError("surface: expected a round body about the tube, found no cylinder through it") from None
     turn = np.rad2deg(np.arccos(min(1.0, abs(float(fit.shape.axis @ tube.axis)))))
     arc = arc_deg(points, fit.shape)
+    most_turn_deg = 20.0  # between both axes
+    most_rms_mm = 0.3  # of the points about the cylinder: light is ten times as exact
     wrong = {
-        f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > MOST_RMS_MM,
-        f"a cylinder turned by {turn:.0f} deg against the tube": turn > MOST_TURN_DEG,
+        f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > most_rms_mm,
+        f"a cylinder turned by {turn:.0f} deg against the tube": turn > most_turn_deg,
         f"an arc of {arc:.0f} deg": arc < LEAST_ARC_DEG,
     }
     found = [text for text, holds in wrong.items() if holds]

@@ -27,21 +27,13 @@ from recon.segmentation.echo_power import SPREAD_MM
 
 Array = NDArray[np.float64]
 
-SMOOTH_PX = 1.0  # before the first echo of each column is looked for
 TRIALS = 400  # circles through three first echoes
 NEAR_MM = 0.5  # from a circle, of the first echoes that count for it
 LEAST_ARC_DEG = 70.0  # of first echoes; less leaves the radius to chance
-CENTRINGS = 3
-STEP_DEG = 1.0  # between rays
 HALF_ARC_DEG = 85.0  # of rays, on either side of the wall's front
 WINDOW_MM = 1.2  # along a ray, on either side of the rough circle, and
-WINDOW_SPREADS = 3.0  # times the spread along the array
-SAMPLE_MM = 0.02
-EDGE_DB = 10.0  # below the echo's top, where its two edges are taken
 OUTLIER = 3.5  # standard deviations from the smooth outline
-FADING_DEG = 2.0  # sigma of the window in which the brightness' slope along the wall is taken
 CLIPPED = 250.0  # grey level of 255, from which an echo's brightness isn't known
-UNSURE = 2.0  # times the correction for fading, which is its first order alone: standard deviation
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
 ROBUST = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
@@ -111,7 +103,8 @@ def find(image: NDArray, scale: Array, appearance: Appearance | None = None) -> 
     if np.ptp(directions) < np.deg2rad(LEAST_ARC_DEG):
         return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {LEAST_ARC_DEG:.0f}")
     ring = _measured(level, scale, circle, look, grey)
-    for _ in range(CENTRINGS):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
+    centrings = 3
+    for _ in range(centrings):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
         refined = _algebraic(ring.pixels * scale) if ring.found else None
         if refined is None:
             return ring
@@ -174,7 +167,8 @@ def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array
 
     `contrast` is in grey levels, above the column's background; rows above `top` are left out.
     """
-    smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX, borderType=cv2.BORDER_REPLICATE)[top:]
+    smooth_px = 1.0  # before the first echo of each column is looked for
+    smooth = cv2.GaussianBlur(level, (0, 0), smooth_px, borderType=cv2.BORDER_REPLICATE)[top:]
     background = np.median(smooth, axis=1, keepdims=True)  # rows bright along the whole array are no wall
     bright = smooth - background > contrast
     peak = bright & (smooth >= np.roll(smooth, -1, axis=0)) & (smooth >= np.roll(smooth, 1, axis=0))
@@ -216,22 +210,26 @@ def _algebraic(points: Array) -> Array | None:
 
 def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: Appearance, grey: float) -> Ring:
     """Edges along rays from the rough centre, less those off a smooth outline, with their scatter about it."""
-    angle = np.deg2rad(np.arange(-HALF_ARC_DEG, HALF_ARC_DEG + STEP_DEG / 2, STEP_DEG))
+    step_deg = 1.0  # between rays
+    angle = np.deg2rad(np.arange(-HALF_ARC_DEG, HALF_ARC_DEG + step_deg / 2, step_deg))
     rays = np.column_stack([np.sin(angle), -np.cos(angle)])
-    window = WINDOW_MM + WINDOW_SPREADS * look.spread_mm[0]
-    along = np.arange(max(circle[2] - window, 0.3 * circle[2]), circle[2] + window, SAMPLE_MM)
+    window_spreads = 3.0  # times the spread along the array
+    window = WINDOW_MM + window_spreads * look.spread_mm[0]
+    sample_mm = 0.02
+    along = np.arange(max(circle[2] - window, 0.3 * circle[2]), circle[2] + window, sample_mm)
     places = (circle[:2] + rays[:, None] * along[:, None]) / scale
     profiles = map_coordinates(level, [places[..., 1], places[..., 0]], order=1, mode="constant", cval=0.0)
     height, width = level.shape
     inside = ((places >= 0) & (places <= [width - 1, height - 1])).all(axis=(1, 2)) & (
         places[..., 1].min(axis=1) * scale[1] > 1.0
     )
-    middle, extent = _echo_middles(profiles, EDGE_DB * grey, look.min_contrast_db * grey)
+    edge_db = 10.0  # below the echo's top, where its two edges are taken
+    middle, extent = _echo_middles(profiles, edge_db * grey, look.min_contrast_db * grey)
     good = inside & np.isfinite(middle)
     if good.sum() < LEAST_EDGES:
         return _none(f"too few edges: {good.sum()} of {len(angle)} rays")
     angle, rays = angle[good], rays[good]
-    radius, extent = along[0] + SAMPLE_MM * middle[good], SAMPLE_MM * extent[good]
+    radius, extent = along[0] + sample_mm * middle[good], sample_mm * extent[good]
     outline, scatter = _smooth_outline(angle, radius, extent)
     kept = np.abs(radius - outline) < OUTLIER * scatter * extent + FLOOR_MM
     if kept.sum() < LEAST_EDGES:
@@ -243,7 +241,8 @@ def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: App
     growth = np.log(10) / 10 / grey * _slopes(angle, peaks) / radius  # of power, nepers a mm
     fading = growth * (wide - deep) * np.sin(angle) * np.cos(angle)
     radius = radius + bend + fading
-    sigma = np.sqrt((scatter * extent[kept]) ** 2 + FLOOR_MM**2 + (UNSURE * fading) ** 2)
+    unsure = 2.0  # times the correction for fading, which is its first order alone: standard deviation
+    sigma = np.sqrt((scatter * extent[kept]) ** 2 + FLOOR_MM**2 + (unsure * fading) ** 2)
     across = rays / scale  # px for 1 mm
     covariance = sigma[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
     return Ring((circle[:2] + radius[:, None] * rays) / scale, covariance)
@@ -276,7 +275,8 @@ def _slopes(angle: Array, peaks: Array) -> Array:
     if known.sum() < LEAST_EDGES:
         return np.zeros_like(peaks)
     at, level = angle[known], peaks[known]
-    weight = np.exp(-0.5 * ((at[:, None] - at) / np.deg2rad(FADING_DEG)) ** 2)
+    fading_deg = 2.0  # sigma of the window in which the brightness' slope along the wall is taken
+    weight = np.exp(-0.5 * ((at[:, None] - at) / np.deg2rad(fading_deg)) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     away = at - (weight @ at)[:, None]
     return np.interp(angle, at, (weight * away) @ level / np.maximum((weight * away**2).sum(axis=1), 1e-12))

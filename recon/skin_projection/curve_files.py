@@ -14,7 +14,6 @@ from recon.skin_projection.projector_image import Lines
 from recon.skin_projection.skin_curve import SkinCurve
 
 SCHEMA = "sonotwin-curves/1"
-ABOVE_MM = 0.2  # the skin, so that strips don't sink into it
 DIGITS = 4  # of mm
 
 
@@ -38,7 +37,8 @@ def write_ply(path: Path, curves: Sequence[SkinCurve], lines: Lines) -> None:
 
 def strips(curves: Sequence[SkinCurve], lines: Lines) -> dict[str, trimesh.Trimesh]:
     """Strips by the curves' names, of those that have any piece."""
-    made = {curve.name: skin_curve.strip(curve, lines.of(curve).width_mm, ABOVE_MM) for curve in curves}
+    above_mm = 0.2  # the skin, so that strips don't sink into it
+    made = {curve.name: skin_curve.strip(curve, lines.of(curve).width_mm, above_mm) for curve in curves}
     return {name: strip for name, strip in made.items() if len(strip.faces)}
 
 

@@ -16,7 +16,6 @@ from recon.skin_projection.skin_curve import SkinCurve
 Image = NDArray[np.uint8]
 
 PLAIN = 128  # grey of a skin that carries none
-DIMMED = 0.5  # of the skin's grey, so that lines stand out
 
 
 def expected(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camera: Camera, lines: Lines) -> Image:
@@ -27,7 +26,8 @@ def expected(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camer
     within = ((pixels >= 0) & (pixels < [width, height])).all(axis=1)
     u, v = pixels[within].astype(int).T
     greys = meshes.greys_of(skin)
-    view[v, u] = DIMMED * (PLAIN if greys is None else greys[within])
+    dimmed = 0.5  # of the skin's grey, so that lines stand out
+    view[v, u] = dimmed * (PLAIN if greys is None else greys[within])
     filled = np.where(view == 0, cv2.dilate(view, np.ones((3, 3), np.uint8)), view)  # between vertices that are farther apart
     seen = projector_image.in_sight(curves, skin, camera)
     both = {name: points & seen[name] for name, points in lit.items()}

@@ -25,7 +25,6 @@ Length = Annotated[float, Field(ge=0.5, le=100)]
 
 FINE = 8  # parts of a pixel along each axis, by which its coverage is counted
 SHIFT = 4  # binary digits behind the point, of corners for OpenCV
-HIDDEN_MM = 0.5  # that something stands before a point of the skin, to hide it: far above the noise of a surface
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,8 @@ def visible(points: Array, skin: trimesh.Trimesh, device: Camera) -> NDArray[np.
     sight = Sight.of_device(device)
     hits = first_hits(sight, np.where(within[:, None], sight.chart(points)[:, :2], np.nan), skin).points
     before = np.linalg.norm(points - device.centre, axis=1) - np.linalg.norm(hits - device.centre, axis=1)
-    return within & ~(before > HIDDEN_MM)
+    hidden_mm = 0.5  # that something stands before a point of the skin, to hide it: far above the noise of a surface
+    return within & ~(before > hidden_mm)
 
 
 def quadrilaterals(curve: SkinCurve, width_mm: float, device: Camera) -> Array:

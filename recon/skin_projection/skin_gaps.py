@@ -14,10 +14,7 @@ from recon.skin_projection.lines_of_sight import Sight
 
 Array = NDArray[np.float64]
 
-WIDEST_MM = 15.0  # way of a curve over a hole
-AROUND_MM = 4.0  # of the skin, beyond the curve's ends at the hole
 OPEN = np.deg2rad(100)  # widest sector about the hole without skin
-UNEVEN_MM = 0.3  # standard deviation of the skin about the quadratic, beyond which it isn't bridged
 FEWEST = 50  # vertices around
 
 
@@ -30,15 +27,17 @@ def bridged(points: Array, chain: Array, sight: Sight, skin: trimesh.Trimesh) ->
     if not missing.any() or missing.all():
         return points
     result, charted = points.copy(), sight.chart(skin.vertices)
+    widest_mm = 15.0  # way of a curve over a hole
+    uneven_mm = 0.3  # standard deviation of the skin about the quadratic, beyond which it isn't bridged
     for gap in _gaps(missing, bool((chain[0] == chain[-1]).all())):
         places = chain[gap]
         way = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
-        nearness = _patch(places, charted) if way <= WIDEST_MM else None
+        nearness = _patch(places, charted) if way <= widest_mm else None
         if nearness is not None:
             filled, uneven = nearness
             at = sight.world(np.column_stack([places, filled]))
             off = sight.world(np.column_stack([places, filled + uneven])) - at
-            if np.linalg.norm(off, axis=1).max() <= UNEVEN_MM:
+            if np.linalg.norm(off, axis=1).max() <= uneven_mm:
                 result[gap] = at
     return result
 
@@ -59,7 +58,8 @@ def _gaps(missing: NDArray[np.bool_], closed: bool) -> Iterator[NDArray[np.int64
 def _patch(places: Array, charted: Array) -> tuple[Array, float] | None:
     """Nearness : (k,) at places on the chart by the skin around them, and the skin's standard deviation; None for its rim."""
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
-    reach = np.linalg.norm(places - middle, axis=1).max() + AROUND_MM
+    around_mm = 4.0  # of the skin, beyond the curve's ends at the hole
+    reach = np.linalg.norm(places - middle, axis=1).max() + around_mm
     off = charted[:, :2] - middle
     near = np.einsum("ij,ij->i", off, off) < reach**2
     if np.count_nonzero(near) < FEWEST:

@@ -15,7 +15,6 @@ from scenes.handheld.mesh_parts import Part
 Array = NDArray[np.float64]
 
 MARGIN_MM = 3.0  # of white around each disc, at least
-SHEET_MM = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
 CLEAR_MM = 1.0  # between a disc and what is not to cover it
 SOFT = 0.6  # of a finger's radius: what gives way where it is pressed against the board
 
@@ -58,7 +57,8 @@ def build_board(rng: np.random.Generator, low: Array, high: Array, thickness_mm:
     x, y = np.array([low[0], high[0], high[0], low[0]]), np.array([low[1], low[1], high[1], high[1]])
     front = trimesh.Trimesh(np.column_stack([x, y, np.zeros(4)]), [[0, 1, 2], [0, 2, 3]], process=False)
     middle = np.append((low + high) / 2, 0)
-    solid = lofts.box([*size, thickness - SHEET_MM], middle - [0, 0, (thickness + SHEET_MM) / 2])
+    sheet_mm = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
+    solid = lofts.box([*size, thickness - sheet_mm], middle - [0, 0, (thickness + sheet_mm) / 2])
     parts = [Part("target", front, False), Part("board", solid, False)]
     total = thickness
     if rng.uniform() < 0.45:

@@ -22,7 +22,6 @@ from twin.sensor import Exposure, expose
 
 TRANSFER_NS = 5_000_000  # from the end of an exposure until the image is in memory; assumed, of a camera at USB 3
 REFRESH_NS = 16_666_667  # of the projector's display, until a pattern is on as a whole
-FREE_NS = 33_333_333  # from frame to frame of a camera that runs free
 LONGEST_S, HIGHEST_GAIN = 10.0, 16.0  # that the virtual cameras can be set to
 
 
@@ -117,8 +116,9 @@ class VirtualCamera:
         """Wait for the next frame; None if none came in time."""
         if self._trigger is None:
             raise DeviceError(f"{self.name}: expected a camera that was started, found one at rest")
+        free_ns = 33_333_333  # from frame to frame of a camera that runs free
         if self._trigger == "free" and not self._exposed:
-            self._rig.clock.advance_to(self._rig.clock.now_ns + FREE_NS)
+            self._rig.clock.advance_to(self._rig.clock.now_ns + free_ns)
             self.expose_now()
         if self._trigger == "hardware" and not self._exposed:
             self._rig.refresh()

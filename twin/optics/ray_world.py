@@ -11,8 +11,6 @@ from recon.geometry import rigid
 from recon.geometry.primitives import Sphere
 from scenes.scene_types import Material, Scene, Thing
 
-FILLED = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
-GEL_ROUGHNESS, GEL_IOR = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
 
 
@@ -24,7 +22,8 @@ def build_world(scene: Scene) -> mi.Scene:
 def is_convex(things: Sequence[Thing]) -> bool:
     """Whether closed things that don't overlap make up one convex body: they then fill their convex hull."""
     hull = ConvexHull(np.concatenate([thing.mesh.vertices for thing in things]))
-    return sum(thing.mesh.volume for thing in things) > (1 - FILLED) * hull.volume
+    filled = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
+    return sum(thing.mesh.volume for thing in things) > (1 - filled) * hull.volume
 
 
 def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) -> None:
@@ -95,9 +94,10 @@ def to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dict
         dry = coated(reflectance, material.roughness, material.ior)
     if not has_wet:
         return dry
-    same = body_reflection(dry) / body_reflection(coated(reflectance, GEL_ROUGHNESS, GEL_IOR))
+    gel_roughness, gel_ior = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
+    same = body_reflection(dry) / body_reflection(coated(reflectance, gel_roughness, gel_ior))
     under_gel = ramp(0, same) if has_albedo else same * material.reflectance
-    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": coated(under_gel, GEL_ROUGHNESS, GEL_IOR)}
+    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": coated(under_gel, gel_roughness, gel_ior)}
 
 
 def body_reflection(bsdf: dict) -> float:

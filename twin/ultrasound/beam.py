@@ -29,9 +29,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex64]
 
 NEAREST_MM = 2.0  # where the beam at the face is taken; Fresnel's approximation fails nearer
-ELEMENTS = 400  # points of the aperture in the integral
 OVERSAMPLING = 2  # axial samples a row of the image
-FAINT = 2e-3  # of the peak: the point spread ends there (-54 dB)
 EDGES = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
 REACH_MM = 4.0  # of the point spread along the array, at most
 STEP_MM = 0.025  # of the elevational table
@@ -57,8 +55,9 @@ def diffracted(
     offsets: Array, depth: float, aperture: float, focus: float, wavelength: float, apodised: bool
 ) -> NDArray[np.complex128]:
     """Field H : (n,) of an aperture at offsets : (n,) mm from its axis, at a depth; `apodised` by a Hann window."""
-    s = (np.arange(ELEMENTS // 2) + 0.5) / ELEMENTS  # of one half; the other adds its mirror image: exp(ia) + exp(-ia) = 2 cos(a)
-    weight = (2 * np.cos(np.pi * s) ** 2 if apodised else np.ones(ELEMENTS // 2)) * aperture / ELEMENTS
+    elements = 400  # points of the aperture in the integral
+    s = (np.arange(elements // 2) + 0.5) / elements  # of one half; the other adds its mirror image: exp(ia) + exp(-ia) = 2 cos(a)
+    weight = (2 * np.cos(np.pi * s) ** 2 if apodised else np.ones(elements // 2)) * aperture / elements
     s = s * aperture
     k = 2 * np.pi / wavelength
     lens = weight * np.exp(1j * k * s**2 / 2 * (1 / depth - 1 / focus))
@@ -103,7 +102,8 @@ def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128
         sent = diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
         table[k] = sent * diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
-    seen = np.abs(table) >= FAINT * np.abs(table).max(axis=1, keepdims=True)
+    faint = 2e-3  # of the peak: the point spread ends there (-54 dB)
+    seen = np.abs(table) >= faint * np.abs(table).max(axis=1, keepdims=True)
     reach = np.maximum((np.arange(taps + 1) * seen).max(axis=1), 1)
     return np.hstack([table[:, :0:-1], table]), reach
 

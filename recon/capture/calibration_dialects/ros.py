@@ -17,7 +17,6 @@ from recon.geometry.camera import Array, Camera
 from recon.model.calibration import WORLD, Calibration
 
 ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
-LEAST_FORWARD = 0.1  # cosine
 
 
 class Rectified(NamedTuple):
@@ -96,9 +95,10 @@ def _rectified(cameras: Sequence[Camera]) -> list[tuple[Array, Array]]:
         turns = [np.array(rows), np.array(rows) @ pose[:3, :3].T]
         shift[axis] = -(along @ between) / MM
     seen = []  # at the middles of the images, turned; of devices that look aside of the common view, none
+    least_forward = 0.1  # cosine
     for turn, camera in zip(turns, cameras, strict=True):
         middle = turn @ np.linalg.solve(camera.matrix, np.append((np.array(camera.size) - 1) / 2, 1))
-        seen += [middle[:2] / middle[2]] if middle[2] > LEAST_FORWARD else []
+        seen += [middle[:2] / middle[2]] if middle[2] > least_forward else []
     centre = (np.array(cameras[0].size) - 1) / 2 - focal * np.mean(seen or [np.zeros(2)], axis=0)
     plain = np.column_stack([camera_dialects.pinhole(focal, focal, *centre), np.zeros(3)])
     moved = plain + np.pad(focal * shift[:, None], ((0, 0), (3, 0)))

@@ -23,9 +23,7 @@ MOST_WAITING = 64  # messages that nobody has fetched yet; beyond, the oldest ar
 MOST_WAITING_BYTES = 128 << 20
 PIECE = 1 << 18  # bytes that are read at once
 LOOK_S = 0.2  # between two looks at whether to end
-CONNECT_S = 5.0
 AGAIN_S = 1.0  # after a lost connection
-MOST_SEEN = 50  # names that are remembered for messages to people
 
 
 @dataclass(frozen=True)
@@ -113,7 +111,8 @@ class Client:
 
     def _listen(self, complaints: Complaints) -> None:
         """Connect, and read until the connection ends."""
-        with socket.create_connection(self._address, CONNECT_S) as connection:
+        connect_s = 5.0
+        with socket.create_connection(self._address, connect_s) as connection:
             connection.settimeout(LOOK_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -150,6 +149,7 @@ class Client:
             self._change.notify()
 
     def _wants(self, header: Header) -> bool:
-        if len(self._seen) < MOST_SEEN:
+        most_seen = 50  # names that are remembered for messages to people
+        if len(self._seen) < most_seen:
             self._seen[header.name] = None
         return self._wanted(header)

@@ -29,10 +29,8 @@ PORT = 18944  # registered for OpenIGTLink
 MOST_CLIENTS = 16
 MOST_NAMES = 256  # pairs of kind and device, of each of which a message is held
 STALLED_S = 30.0  # for one message, after which a client that takes nothing is dropped
-UNSENT_BYTES = 1 << 18  # in the system's memory: what lies there is no longer the newest
 PIECE = 1 << 16  # bytes that are read at once
 LOOK_S = 0.5  # between two looks at whether to end
-MOST_QUERY_BYTES = 1 << 16
 QUERIES = ("GET_", "STT_", "STP_")
 
 Key = tuple[str, str]  # kind and device
@@ -152,7 +150,8 @@ class _Client:
     ) -> None:
         connection.settimeout(STALLED_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UNSENT_BYTES)
+        unsent_bytes = 1 << 18  # in the system's memory: what lies there is no longer the newest
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, unsent_bytes)
         self._connection, self._name, self._answer, self._complaints = connection, name, answer, complaints
         self._waiting = dict(first)
         self._change = threading.Condition()  # of the two beside it
@@ -225,7 +224,8 @@ class _Client:
 
 
 def _is_query(header: Header) -> bool:
-    return header.kind.startswith(QUERIES) and header.size <= MOST_QUERY_BYTES
+    most_query_bytes = 1 << 16
+    return header.kind.startswith(QUERIES) and header.size <= most_query_bytes
 
 
 def _listener(host: str, port: int) -> socket.socket:
