@@ -7,14 +7,13 @@ from scenes import solid_meshes
 from scenes.noise import smooth_noise
 from scenes.scene_types import Material, Thing
 
-THICKNESS_MM = 20.0
-
 
 def table(depth_mm: float, seed: int) -> Thing:
     """A table whose top lies at z = depth_mm, facing the camera, with the grain along x."""
     size_mm = (420.0, 340.0)  # beyond the view of both cameras
     points, triangles = solid_meshes.grid(size_mm, (60, 240))
-    mesh = solid_meshes.slab(points, triangles, THICKNESS_MM)
+    thickness_mm = 20.0
+    mesh = solid_meshes.slab(points, triangles, thickness_mm)
     rng = np.random.default_rng(seed)
     wave_mm = 1.2  # standard deviation of the stripes from straight
     bent = points + np.column_stack([np.zeros(len(points)), wave_mm * smooth_noise(points, 150, rng)])

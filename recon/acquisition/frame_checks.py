@@ -15,9 +15,6 @@ Images = NDArray[np.uint8] | NDArray[np.uint16]
 Share = Annotated[float, Field(gt=0, le=1)]
 
 BRIGHTEST = 99.9  # percentile that counts as the brightest: a few highlights and hot pixels don't
-WINDOW_PX = 15  # about an edge: both of its levels must lie within
-DIRECTIONS = 4  # of edges, told apart: motion leaves those along it sharp
-FEW = 40  # pixels of edges in a direction, with fewer of which nothing is said
 
 
 class Limits(Part):
@@ -83,17 +80,20 @@ def edge_widths(image: Images) -> list[float]:
     smooth = np.float32(image)
     across, down = (cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
     gradient = cv2.magnitude(across, down)
-    window = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
+    window_px = 15  # about an edge: both of its levels must lie within
+    window = np.ones((window_px, window_px), np.uint8)
     step = cv2.dilate(smooth, window) - cv2.erode(smooth, window)
     low, high = np.percentile(smooth[::4, ::4], (100 - BRIGHTEST, BRIGHTEST))
     crest = gradient >= cv2.dilate(gradient, np.ones((3, 3), np.uint8))
     least_step = 0.2  # of the image's range, of an edge that is looked at
-    v, u = np.nonzero(crest & (step > max(least_step * (high - low), 8.0)) & (gradient > 0.3 * step / WINDOW_PX))
+    v, u = np.nonzero(crest & (step > max(least_step * (high - low), 8.0)) & (gradient > 0.3 * step / window_px))
     width = step[v, u] / (np.sqrt(2 * np.pi) * gradient[v, u])
-    turn = np.arctan2(down[v, u], across[v, u]) * DIRECTIONS / np.pi
-    direction = np.rint(turn).astype(int) % DIRECTIONS
+    directions = 4  # of edges, told apart: motion leaves those along it sharp
+    turn = np.arctan2(down[v, u], across[v, u]) * directions / np.pi
+    direction = np.rint(turn).astype(int) % directions
     sharp = 30.0  # percentile of the edges' widths that counts: others lie on shades, and beside other edges
-    found = [np.percentile(width[direction == k], sharp) for k in range(DIRECTIONS) if np.sum(direction == k) >= FEW]
+    few = 40  # pixels of edges in a direction, with fewer of which nothing is said
+    found = [np.percentile(width[direction == k], sharp) for k in range(directions) if np.sum(direction == k) >= few]
     step_blur_px = 0.6  # standard deviation by which the gradient's own differences widen an edge, with the pixels
     return [float(np.sqrt(max(each**2 - step_blur_px**2, 0.0))) for each in found]
 

@@ -22,7 +22,6 @@ from recon.own_requests import FOREIGN, LOOPBACK, is_own
 
 MOST_VISITORS = 8  # at once
 PATIENCE_S = 5.0  # with a visitor who says nothing
-SAID = 20  # last lines that are shown
 
 
 class Preview:
@@ -41,8 +40,9 @@ class Preview:
 
     def say(self, text: str) -> None:
         """Show a line."""
+        said = 20  # last lines that are shown
         with self._lock:
-            self._said = [*self._said, text][-SAID:]
+            self._said = [*self._said, text][-said:]
 
     def state(self) -> dict[str, object]:
         """What there is to show, without images."""

@@ -16,8 +16,6 @@ from recon.acquisition.still_session import StillSession
 from recon.devices.pattern_player import Pattern, Stage
 from recon.model.patterns import Patterns
 
-STILL = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
-
 
 @dataclass(frozen=True)
 class SurfacePlan:
@@ -67,10 +65,11 @@ def _faults(session: StillSession, plan: SurfacePlan, taken: dict[str, NDArray])
 
 def _moved(before: dict[str, NDArray], after: dict[str, NDArray]) -> list[str]:
     """Faults of what moved, or was covered, while the fringes were taken."""
+    still = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
     return [
         f"{name} moved: its image changed by {100 * change:.1f} % meanwhile; lay all things still"
         for name in before
-        if (change := changed(before[name], after[name])) > STILL
+        if (change := changed(before[name], after[name])) > still
     ]
 
 

@@ -31,7 +31,6 @@ RULER_MM = 100.0
 RULER_TEXT = "print at 100 %; this must be 100.0 mm"
 LEFT_MM = 10.0  # beside the card, for the upright ruler
 BELOW_MM = 17.0  # below the card, for the other ruler and the small print beside it
-PRINT_MM = 80.0  # width of the small print, at least
 FONT, BOLD, FONT_MM = "Helvetica", "Helvetica-Bold", 2.2  # 6.2 points
 CAPTION_MM = 1.8  # height of the letters on the card
 
@@ -63,7 +62,8 @@ class Sheet(NamedTuple):
 def needed(card: Size, margin_mm: float) -> Size:
     """Size of the paper that a card of a size needs, with rulers, marks and a margin on which no printer prints."""
     marks_mm = 5.0  # around the card, for the cut marks
-    width = max(card[0] + 2 * marks_mm, RULER_MM + PRINT_MM)
+    print_mm = 80.0  # width of the small print, at least
+    width = max(card[0] + 2 * marks_mm, RULER_MM + print_mm)
     return 2 * margin_mm + LEFT_MM + width, 2 * margin_mm + BELOW_MM + max(card[1] + 2 * marks_mm, RULER_MM)
 
 

@@ -8,11 +8,7 @@ from numpy.typing import NDArray
 
 from recon.geometry.camera import Array
 
-SMOOTHING = 1.0  # px, standard deviation: taken out of the blur again
-DIRECTIONS = 4  # over half a turn
 STEEPEST = 0.998  # quantile of the slopes: discs of 20 px radius have 1 % of all pixels on edges of one direction
-DARK, BRIGHT = 0.05, 0.95  # quantiles of the levels, both of which a board has many of
-AROUND = 0.1  # of the points' extent, beyond them
 
 
 class Blur(NamedTuple):
@@ -28,15 +24,19 @@ def blur(image: NDArray, pixels: Array) -> Blur:
     An edge of contrast C that is blurred by s has the steepest slope `C / (sqrt(2 pi) s)` across it.
     """
     seen = pixels[np.isfinite(pixels).all(axis=1)]
-    beyond = AROUND * np.ptp(seen, axis=0)
+    around = 0.1  # of the points' extent, beyond them
+    beyond = around * np.ptp(seen, axis=0)
     left, top = np.maximum(seen.min(axis=0) - beyond, 0).astype(int)
     right, low = (seen.max(axis=0) + beyond + 2).astype(int)
-    level = cv2.GaussianBlur(np.float32(image[top:low, left:right]), (0, 0), SMOOTHING)
+    smoothing = 1.0  # px, standard deviation: taken out of the blur again
+    level = cv2.GaussianBlur(np.float32(image[top:low, left:right]), (0, 0), smoothing)
     across, down = (cv2.Sobel(level, cv2.CV_32F, du, dv, ksize=1, scale=0.5) for du, dv in ((1, 0), (0, 1)))
-    contrast = float(np.subtract(*np.quantile(level, [BRIGHT, DARK])))
+    dark, bright = 0.05, 0.95  # quantiles of the levels, both of which a board has many of
+    contrast = float(np.subtract(*np.quantile(level, [bright, dark])))
     widths = []
-    for way in np.pi / DIRECTIONS * np.arange(DIRECTIONS):
+    directions = 4  # over half a turn
+    for way in np.pi / directions * np.arange(directions):
         steepest = float(np.quantile(np.abs(np.cos(way) * across + np.sin(way) * down), STEEPEST))
         width = contrast / (np.sqrt(2 * np.pi) * max(steepest, 1e-9))
-        widths.append(np.sqrt(max(width**2 - SMOOTHING**2, 0.0)))
+        widths.append(np.sqrt(max(width**2 - smoothing**2, 0.0)))
     return Blur(min(widths), max(widths))

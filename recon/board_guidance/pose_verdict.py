@@ -18,10 +18,6 @@ from recon.geometry.camera import Array
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Sighting
 
-LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
-BLURRED_PX = 3.0  # standard deviation, in the softest direction
-SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
-
 
 @dataclass(frozen=True)
 class Observation:
@@ -84,11 +80,13 @@ def _camera_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
     """What is wrong with the cameras' images, the gravest first."""
     sighting = observation.sighting
     yield from (_not_found(device, sighting) for device in so_far.sizes if device != PROJECTOR and device not in sighting.pixels)
+    blurred_px = 3.0  # standard deviation, in the softest direction
+    smeared = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
     for device, image in observation.lit.items():
         found = blur(image, sighting.pixels[device])
-        if found.most > SMEARED[0] * found.least + SMEARED[1]:
+        if found.most > smeared[0] * found.least + smeared[1]:
             yield f"{device}: smeared by {found.most:.1f} px: the board moved during the exposure; rest it, or expose shorter"
-        elif found.most > BLURRED_PX:
+        elif found.most > blurred_px:
             yield f"{device}: blurred by {found.most:.1f} px: out of focus; hold it nearer to the middle distance, or focus"
 
 
@@ -131,7 +129,8 @@ def _too_alike(pose: Array, so_far: SoFar, gain: float, asked: float | None, rea
     if apart_mm[nearest] < ALIKE_MM and apart_deg[nearest] < ALIKE_DEG:
         away = f"{apart_mm[nearest]:.0f} mm and {apart_deg[nearest]:.0f} deg from it"
         return f"too like pose {so_far.sightings[nearest].name}, {away}: {adds}; hold it as shown"
-    return None if gain >= LEAST_SHARE * best else f"{adds}; hold it as shown"
+    least_share = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
+    return None if gain >= least_share * best else f"{adds}; hold it as shown"
 
 
 def _best_gain(so_far: SoFar, reach: Reach) -> float:

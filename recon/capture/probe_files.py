@@ -40,7 +40,6 @@ SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
 AS_NPZ = f"give it as {AUTHORS} with sx, sy, T_I_T and"  # a plain matrix, for what there is no place in it
-MOST_ROWS = 1e5  # of a scanner's image
 PLUS_ENDS = ("Image", "Probe")
 SEPARATORS = bytes.maketrans(b",;[]()", b"      ")
 
@@ -192,7 +191,8 @@ def _checked(path: Path, name: str, read: ProbeCalibration, stated: object, way:
         raise InputError(f"{path}: {name}: expected {rigid.RIGID}, in mm, found {found}")
     if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
         raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
-    if not abs(read.face_row) < MOST_ROWS:
+    most_rows = 1e5  # of a scanner's image
+    if not abs(read.face_row) < most_rows:
         raise InputError(f"{path}: face_row: expected a row of an image, found {read.face_row:g}")
     if stated is not None:
         return _in_mm(path, read, lengths.unit_of(path, stated))

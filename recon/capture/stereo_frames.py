@@ -24,7 +24,6 @@ from recon.threads import mapped
 log = logging.getLogger(__name__)
 
 AT_ONCE = 2  # pairs that are read, while one more waits or is worked on
-NEAR = 0.75  # of a period, that frames of a pair are apart at most: half, where cameras run freely, and their jitter
 APART, APART_NS = 0.1, 2_000_000  # of the period, and in time, that pairs are apart before it is said
 Pair = tuple[Images, Images]
 
@@ -111,7 +110,8 @@ def _partners(
     periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
     alone_ns = 33_000_000  # taken for the period where a single frame tells none
     period = min(periods) if periods else alone_ns
-    first, second = _matched(times[0], times[1], NEAR * period)
+    near = 0.75  # of a period, that frames of a pair are apart at most: half, where cameras run freely, and their jitter
+    first, second = _matched(times[0], times[1], near * period)
     most_alone = 0.25  # share of a camera's frames that may be without a partner
     for one, other, paired in ((0, 1, first), (1, 0, second)):
         alone = np.setdiff1d(np.arange(len(times[one])), paired)
@@ -121,7 +121,7 @@ def _partners(
         k = int(alone[0])
         away = abs(int(times[other][_nearest(times[one][[k]], times[other])[0]]) - int(times[one][k])) * 1e-6
         if len(alone) > most_alone * len(times[one]):
-            wanted = f"a frame of its own within {NEAR * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
+            wanted = f"a frame of its own within {near * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
             counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
             found = f"the nearest {away:.1f} ms away ({len(alone)} such, in {counts})"
             raise InputError(

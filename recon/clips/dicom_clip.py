@@ -31,13 +31,11 @@ from recon.files.regular import check_there, opened
 Dataset = Any
 Result = TypeVar("Result")
 
-MOST_BYTES = 1 << 33
 MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
 PREAMBLE, PREFIX = 128, b"DICM"
 META = 2  # group of the tags before the part that may be packed
 
 LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
-TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
     *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
     *(RuntimeError, TypeError, ValueError, struct.error, zlib.error, MemoryError, NotImplementedError),
@@ -136,7 +134,8 @@ def _lossless(header: Dataset, count: int) -> Iterator[NDArray]:
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
     """Read a file; one that is packed as a whole, which may unpack to more than any memory, up to a bound."""
-    with opened(path, MOST_BYTES) as stream:
+    most_bytes = 1 << 33
+    with opened(path, most_bytes) as stream:
         return pydicom.dcmread(_plain(path, stream), stop_before_pixels=stop_before_pixels)
 
 
@@ -196,8 +195,9 @@ def times(header: Dataset, count: int) -> NDArray[np.float64] | None:
 def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
     """The largest two-dimensional region of tissue, and its scale in mm/px; None where the file has none."""
     best: tuple[Box, tuple[float, float] | None] | None = None
+    two_d, tissue, centimetres = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
     for one in header.get("SequenceOfUltrasoundRegions") or []:
-        if int(one.RegionSpatialFormat) != TWO_D or int(one.get("RegionDataType", TISSUE)) != TISSUE:
+        if int(one.RegionSpatialFormat) != two_d or int(one.get("RegionDataType", tissue)) != tissue:
             continue
         left, top = int(one.RegionLocationMinX0), int(one.RegionLocationMinY0)
         box = left, top, int(one.RegionLocationMaxX1) - left + 1, int(one.RegionLocationMaxY1) - top + 1
@@ -205,7 +205,7 @@ def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | N
             continue
         units = {int(one.get(f"PhysicalUnits{axis}Direction", 0)) for axis in "XY"}
         x, y = (10 * abs(float(one.get(f"PhysicalDelta{axis}", 0))) for axis in "XY")
-        scale = (x, y) if units == {CENTIMETRES} and x > 0 and y > 0 else None
+        scale = (x, y) if units == {centimetres} and x > 0 and y > 0 else None
         if best is None or box[2] * box[3] > best[0][2] * best[0][3]:
             best = box, scale
     return best

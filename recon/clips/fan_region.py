@@ -16,8 +16,6 @@ EXPECTED = "expected a part between two sides and two arcs that changes from fra
 FIELD = "fan=[u,v,first,last,left,right]"
 STIRS_DN = 0.3  # standard deviation over time, of what is dark but no border
 WITHIN = 0.9  # share of the changing part in the fan
-COVERED = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
-EDGE_PX = 12  # of the image, within which an arc may be cut off
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
@@ -51,7 +49,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
     fan = replace(before, first_px=_face(mean, before), last_px=_end(deviation, replace(before, last_px=last)))
     inside = fan.mask((part.shape[0], part.shape[1]))
     within, stirring = inside[part].mean(), (deviation > STIRS_DN)[inside].mean()
-    if within < WITHIN or stirring < COVERED:
+    covered = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
+    if within < WITHIN or stirring < covered:
         found = f"{100 * within:.0f} % of it in a fan, of which {100 * stirring:.0f} % change"
         raise InputError(f"{name}: {expected}, found {found}")
     return fan
@@ -112,6 +111,7 @@ def _radii(part: Mask, u: float, v: float) -> tuple[float, float]:
     ends = np.array([np.quantile(radius[place == k], [0.002, 0.998]) for k in np.unique(place)[1:-1]])
     directions = np.array([angle[place == k].mean() for k in np.unique(place)[1:-1]])
     across, down = u + np.sin(directions) * ends[:, 1], v + np.cos(directions) * ends[:, 1]
-    free = (across > EDGE_PX) & (across < part.shape[1] - EDGE_PX) & (down < part.shape[0] - EDGE_PX)
+    edge_px = 12  # of the image, within which an arc may be cut off
+    free = (across > edge_px) & (across < part.shape[1] - edge_px) & (down < part.shape[0] - edge_px)
     last = np.median(ends[free, 1]) if free.any() else ends[:, 1].max()
     return float(np.median(ends[:, 0])), float(last)

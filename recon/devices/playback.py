@@ -26,7 +26,6 @@ from recon.files.regular import check_there
 DELIVERY_NS = 10_000_000  # from the middle of an exposure to the image in memory: half of 10 ms, and 1.3 MB over USB 3
 CLOCKS = "clocks of their own? record them by one, as sonotwin record does"
 BUFFERED = 4  # frames that wait to be fetched
-MOST_KEPT = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,8 @@ class _Played:
         except InputError as error:
             raise DeviceError(f"{self.name}: {error}") from None
         image.flags.writeable = False
-        if (len(self._kept) + 1) * image.nbytes <= MOST_KEPT:
+        most_kept = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
+        if (len(self._kept) + 1) * image.nbytes <= most_kept:
             self._kept[number] = image
         return image
 

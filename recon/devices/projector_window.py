@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 Pattern = NDArray[np.uint8]
 
 DELAY_S = 0.1  # from drawing to light, if it wasn't measured: projectors take up to five images of 1/60 s
-BENT = 2 / 255  # of full scale, by which a ramp may move a level
 
 
 class ProjectorWindow:
@@ -227,9 +226,10 @@ def _opened(screen: "Screen", display: Display) -> "pyglet.window.Window":
 def _warn_of_bending(screen: "Screen", display: Display) -> None:
     """Log what bends patterns but may be wanted, and what cannot be checked."""
     ramp = displays.gamma_ramp(screen)
+    bent = 2 / 255  # of full scale, by which a ramp may move a level
     if ramp is None:
         log.info("projector: the graphics card's ramp of display %s can't be read here; measure grey steps by a camera", display)
-    elif (off := displays.bent_by(ramp)) > BENT:
+    elif (off := displays.bent_by(ramp)) > bent:
         log.warning(
             "projector: the graphics card's ramp of display %s moves levels by up to %.0f of 255: switch off night light and "
             "colour profiles of this display, unless the ramp is there to make the projector linear",

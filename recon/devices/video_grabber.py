@@ -24,7 +24,6 @@ Image = NDArray[np.uint8]
 
 WAITING = 64  # images that wait to be taken; of a full queue the newest are lost, and missing in the numbers
 AGAIN_S = 1.0  # between tries to open a lost grabber
-SLICE_S = 0.05  # between looks whether it is lost
 
 
 class View(Protocol):
@@ -87,10 +86,11 @@ class VideoGrabber:
             If the grabber is lost, its images have changed their size, or the file has ended.
         """
         end = time.monotonic() + timeout_s
+        slice_s = 0.05  # between looks whether it is lost
         while True:
             fault = self._fault  # what was read before is given before it
             try:
-                return self._frames.get(timeout=max(min(end - time.monotonic(), SLICE_S), 0))
+                return self._frames.get(timeout=max(min(end - time.monotonic(), slice_s), 0))
             except queue.Empty:
                 if fault:
                     raise self._lost() from None

@@ -21,7 +21,6 @@ SCALE, TIME, SIMPLE, BLOCK = 0x2AD7B1, 0xE7, 0xA3, 0xA1
 NUMBER, KIND, CODEC, NAME, COLOUR, WIDTH, HEIGHT, ENCODINGS = 0xD7, 0x83, 0x86, 0x536E, 0x2EB524, 0xB0, 0xBA, 0x6D80
 VIDEO, TEXTS = 1, (0x11, 0x21)  # kinds of tracks
 MOST_TEXT = 1 << 20  # bytes of a field
-MOST_BLOCKS = 10_000_000
 
 
 @dataclass
@@ -71,6 +70,7 @@ def read(path: Path) -> Matroska:
     usual_scale = 1_000_000  # ns
     scale, time, count = usual_scale, 0, 0
     laced = 0x06  # flags of a block with several frames
+    most_blocks = 10_000_000
     with opened(path) as stream:
         end = stream.seek(0, 2)
         at = 0
@@ -95,7 +95,7 @@ def read(path: Path) -> Matroska:
             elif element in (SIMPLE, BLOCK):
                 track = _number(path, stream)
                 after, flags = int.from_bytes(stream.read(2), "big", signed=True), stream.read(1)
-                if track is None or not flags or stream.tell() > at or (count := count + 1) > MOST_BLOCKS:
+                if track is None or not flags or stream.tell() > at or (count := count + 1) > most_blocks:
                     raise _damaged(path, begin)
                 if flags[0] & laced:
                     raise InputError(f"{path}: expected a frame in each block, found several in one at byte {begin}")

@@ -40,8 +40,6 @@ NRRD_TYPES = {  # those of sequences, each with many names
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
 UNCOMPRESSED, GREY = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
-MOST_PX = 1 << 26  # of a video's images
-MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
 
 
 @dataclass(frozen=True)
@@ -238,7 +236,8 @@ def _check_length(file: ImageFile) -> None:
         said = file.fields.get("CompressedDataSize", "").split()
         if said and said[0].isdecimal() and there < int(said[0]):
             raise file.fault("pixels", f"{said[0]} packed bytes", f"{there}, the file has been cut short")
-    if file.data_bytes > there * (MOST_UNPACKED if file.packed else 1):
+    most_unpacked = 1100  # times the packed size: deflate reaches 1032
+    if file.data_bytes > there * (most_unpacked if file.packed else 1):
         raise file.fault("pixels", f"{file.data_bytes} bytes", f"{there}, the file has been cut short or damaged")
 
 
@@ -266,7 +265,8 @@ def _matroska(path: Path) -> ImageFile:
         frames = tuple(sorted(frames))  # as they are shown, which may not be the order in which they are decoded
     channels = 1 if track.text(matroska.COLOUR) == GREY and not coded else 3
     wrong = [frame.length for frame in frames if frame.length != width * height * channels]
-    if not 0 < width * height <= MOST_PX or (wrong and not coded):
+    most_px = 1 << 26  # of a video's images
+    if not 0 < width * height <= most_px or (wrong and not coded):
         raise fault(path, "frames", f"{width} x {height} pixels of {channels} bytes", f"{(wrong or [0])[0]} bytes")
     fields = {"Kinds": "domain domain list", "TrackName": track.text(matroska.NAME)}
     of_time: dict[int, list[int]] = {}

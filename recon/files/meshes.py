@@ -17,7 +17,6 @@ from recon.files.regular import read_bytes
 # glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
 PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # of a vertex, for which meshes have their own places
-FARTHEST_MM = 1e7
 DAMAGE = (  # what trimesh raises on files damaged at random
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
     *(NotImplementedError, AssertionError, ZeroDivisionError, NameError, struct.error),
@@ -59,8 +58,9 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
         raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: expected {expected} of triangles, found none in it")
-    if not (np.abs(mesh.vertices) < FARTHEST_MM).all():
-        raise InputError(f"{path}: expected {expected} of finite places, below {FARTHEST_MM:g} mm, found others among them")
+    farthest_mm = 1e7
+    if not (np.abs(mesh.vertices) < farthest_mm).all():
+        raise InputError(f"{path}: expected {expected} of finite places, below {farthest_mm:g} mm, found others among them")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
         raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")

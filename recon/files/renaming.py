@@ -5,7 +5,6 @@ import errno
 import os
 from pathlib import Path
 
-HERE = -100  # AT_FDCWD: paths are relative to the working folder
 EXCHANGE = 2  # RENAME_EXCHANGE of Linux
 UNSUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)  # by the file system, or by the kernel
 
@@ -18,7 +17,8 @@ def exchange(one: Path, other: Path) -> bool:
     renameat2 = _renameat2()
     if renameat2 is None:
         return False
-    if renameat2(HERE, os.fsencode(one), HERE, os.fsencode(other), EXCHANGE) == 0:
+    here = -100  # AT_FDCWD: paths are relative to the working folder
+    if renameat2(here, os.fsencode(one), here, os.fsencode(other), EXCHANGE) == 0:
         return True
     number = ctypes.get_errno()
     if number in UNSUPPORTED:

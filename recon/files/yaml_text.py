@@ -17,7 +17,6 @@ from recon.files.regular import read_text, shown
 
 MOST_BYTES = 1 << 22
 MOST_VALUES = 100_000  # with those for which aliases stand
-MOST_DEPTH = 64  # of lists and maps within each other
 MOST_DIGITS = 40  # of a whole number
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
 FAULTS = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, RecursionError)  # of tags that don't fit, too
@@ -89,6 +88,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
     sizes: dict[str, int | None] = {}  # values below an anchor; None while it is open
     open_ones: list[tuple[str | None, int]] = []  # anchor, and values before it
     values = 0
+    most_depth = 64  # of lists and maps within each other
     for event in _parsed(path, text):
         if isinstance(event, AliasEvent):
             size = sizes.get(event.anchor, 0)
@@ -113,7 +113,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
                 sizes[anchor] = values - before
         elif isinstance(event, DocumentStartEvent):
             sizes.clear()
-        if len(open_ones) > MOST_DEPTH:
+        if len(open_ones) > most_depth:
             raise InputError(f"{shown(path)}: expected YAML, found values nested too deeply")
         if values > most:
             raise InputError(f"{shown(path)}: expected YAML of up to {most} values, found more, written out or as aliases")

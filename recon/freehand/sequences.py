@@ -61,7 +61,6 @@ RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
 SHOWN = "Physical"  # where 3D Slicer shows the images, its RAS
 TRACK_NAME = "TrackName"  # field of the file that names the frame of the images shown there
-SAME = 1e-6  # of the entries of matrices
 
 
 class FrameNames(NamedTuple):
@@ -189,7 +188,8 @@ def lies_elsewhere(frames: Frames, reference: str) -> bool:
     except InputError:
         return False
     placed = lps_from_reference[np.isfinite(lps_from_reference).all(axis=(1, 2))]
-    return bool(np.abs(placed - np.eye(4)).max(initial=0) > SAME)
+    same = 1e-6  # of the entries of matrices
+    return bool(np.abs(placed - np.eye(4)).max(initial=0) > same)
 
 
 def read_sequence(path: Path) -> Frames:

@@ -26,7 +26,6 @@ SCHEMA = (
 )
 MARKUPS, TRANSFORM, SCRIPT, README = "masses.mrk.json", "target_to_world.tfm", "show.py", "README.txt"
 TEMPLATES = Path(__file__).parent
-SLICE_MM = 0.5  # thickness of a B-scan as a volume of one slice
 
 
 def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: int) -> None:
@@ -71,7 +70,8 @@ def slice_of(scene: FusedScene, k: int) -> Volume:
     lengths = np.linalg.norm(matrix[:3, :2], axis=0)
     along = matrix[:3, :2] / lengths
     directions = np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
-    return Volume(scene.images[k][None], matrix[:3, 3], np.append(lengths, SLICE_MM), directions)
+    slice_mm = 0.5  # thickness of a B-scan as a volume of one slice
+    return Volume(scene.images[k][None], matrix[:3, 3], np.append(lengths, slice_mm), directions)
 
 
 def write_transform(path: Path, world_from_target: np.ndarray) -> None:

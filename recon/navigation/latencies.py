@@ -6,9 +6,6 @@ from threading import Lock
 
 import numpy as np
 
-REMEMBERED_NS = 10_000_000_000
-FEWEST = 2  # of which figures are made
-
 
 @dataclass(frozen=True)
 class Latency:
@@ -28,16 +25,18 @@ class Latencies:
 
     def add(self, exposed_ns: int, published_ns: int) -> None:
         """Take in one, by monotonic times."""
+        remembered_ns = 10_000_000_000
         with self._lock:
             self._pairs.append((exposed_ns, published_ns))
-            while self._pairs[0][1] < published_ns - REMEMBERED_NS:
+            while self._pairs[0][1] < published_ns - remembered_ns:
                 self._pairs.popleft()
 
     def figures(self) -> Latency | None:
         """Median, 99 %, and number a second; None of less than two."""
         with self._lock:
             pairs = np.array(self._pairs, np.int64).reshape(-1, 2)
-        if len(pairs) < FEWEST or pairs[-1, 1] <= pairs[0, 1]:
+        fewest = 2  # of which figures are made
+        if len(pairs) < fewest or pairs[-1, 1] <= pairs[0, 1]:
             return None
         median, high = np.percentile((pairs[:, 1] - pairs[:, 0]) * 1e-6, [50, 99])
         return Latency(float(median), float(high), (len(pairs) - 1) / float(pairs[-1, 1] - pairs[0, 1]) * 1e9)

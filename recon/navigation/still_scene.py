@@ -11,8 +11,6 @@ from recon.model.rig import Target
 from recon.navigation.publishing import StillScene
 from recon.segmentation import containment, mass_files
 
-STEP_MM = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
-
 
 def read_scene(
     skin_file: Path | None, masses: Path | None, target: Target, probe: ProbeCalibration, width: int, part_table: bool = True
@@ -44,7 +42,8 @@ def read_scene(
 def _coarse(path: Path, part_table: bool) -> trimesh.Trimesh:
     whole = containment.read_skin(path)
     parted = skin.by_plane(whole).skin if part_table else whole
-    return outside_out(fused_scene.merged(whole if parted is None else parted, STEP_MM))
+    step_mm = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
+    return outside_out(fused_scene.merged(whole if parted is None else parted, step_mm))
 
 
 def outside_out(skin: trimesh.Trimesh) -> trimesh.Trimesh:

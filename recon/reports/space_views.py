@@ -14,7 +14,6 @@ VERTICES = 60_000  # of a 3-D view; a laptop without a graphics card turns these
 EYE = {"eye": {"x": -0.6, "y": -1.5, "z": 1.05}, "center": {"x": 0.02, "y": -0.05, "z": -0.22}}
 EYE_INSIDE = {"eye": {"x": -0.8, "y": -1.45, "z": 0.85}, "center": {"x": 0.0, "y": 0.0, "z": -0.16}}
 LEGEND = {"x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": "rgba(0,0,0,0)", "itemsizing": "constant"}  # beside no axis
-LONGEST = 6.0  # times the median: a longer triangle spans a tear
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +170,7 @@ def _triangulated(points: Map) -> tuple[Map, NDArray[np.int32]]:
     a, b, c, d = (points[corner] for corner in corners)
     reach = np.max([np.linalg.norm(p - q, axis=-1) for p, q in ((a, b), (a, c), (b, d), (c, d), (b, c))], axis=0)
     whole = np.isfinite(reach)
-    whole[whole] = reach[whole] < LONGEST * np.median(reach[whole]) if whole.any() else False
+    longest = 6.0  # times the median: a longer triangle spans a tear
+    whole[whole] = reach[whole] < longest * np.median(reach[whole]) if whole.any() else False
     ia, ib, ic, id_ = (number[corner][whole] for corner in corners)
     return points[known], np.concatenate([np.stack([ia, ic, ib], axis=1), np.stack([ib, ic, id_], axis=1)])

@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 
 REACH_MM = 2.4  # of a profile, on either side of the surface
 BIN_MM = 0.2
-MOST_MM = 1.0  # by which a vertex is moved in one round
-STEP_MM = 0.1  # between trial places
 PATCH_MM = 1.0  # standard deviation of the weights by which neighbours are averaged
 FARTHEST = 2.5  # patches: neighbours beyond count nothing
 EVENINGS = 10  # rounds of smoothing over neighbouring vertices
@@ -169,7 +167,9 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     better with it.
     """
     s = -REACH_MM + BIN_MM * (np.arange(profiles.shape[1]) + 0.5)
-    candidates = np.arange(-MOST_MM, MOST_MM + STEP_MM / 2, STEP_MM)
+    most_mm = 1.0  # by which a vertex is moved in one round
+    step_mm = 0.1  # between trial places
+    candidates = np.arange(-most_mm, most_mm + step_mm / 2, step_mm)
     floor = 0.05  # of tissue's power: no level counts as more certain than that of this
     weight = weight / np.maximum(uniform_filter1d(profiles, 5, axis=1, mode="nearest"), floor)
     blurs_mm = (0.25, 0.4, 0.6)  # trial standard deviations; with a narrower one more steps are found beside lines
@@ -186,7 +186,7 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     bend = np.maximum(before + after - 2 * here, 1e-9)
     shift = np.clip((before - after) / (2 * bend), -0.5, 0.5)
     found = (here < NEVER) & (costs.argmin(axis=0) == c)  # not at an end of the trials
-    return np.where(found, candidates[c] + shift * STEP_MM, 0.0), np.where(found, here / bend + 1e-3, NEVER)
+    return np.where(found, candidates[c] + shift * step_mm, 0.0), np.where(found, here / bend + 1e-3, NEVER)
 
 
 def misfits(profiles: Array, weight: Array, trials: Array) -> tuple[Array, Array]:

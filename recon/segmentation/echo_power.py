@@ -28,7 +28,6 @@ SLICE_MM = (  # the same across the image plane, at some depths: (depth, sigma)
     *((4.0, 0.91), (8.0, 0.63), (12.0, 0.37), (15.0, 0.24), (20.0, 0.24)),
     *((30.0, 0.37), (40.0, 0.56), (50.0, 0.8)),
 )
-BRIGHTEST = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 
 
@@ -112,7 +111,8 @@ def averaged(
 def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
     """Power of each grey level : (256,), relative to the mean of tissue whose median level is given."""
     decibels = (np.arange(256) - tissue_grey) * dynamic_range_db / 255
-    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), BRIGHTEST)
+    brightest = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
+    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), brightest)
     table[0] = 0
     return table.astype(np.float32)
 

@@ -20,7 +20,6 @@ from recon.geometry import rigid
 Array = NDArray[np.float64]
 
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
-NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
 FAR_MM = 5.0  # around a mass, to which distances reach
 
 
@@ -92,7 +91,8 @@ def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...
     apart[tuple(np.clip(voxel, 0, np.array(shape[::-1]) - 1).T[::-1])] = False
     k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
     places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
-    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, workers=numba.get_num_threads())
+    neighbours = 6  # vertices that the distance to a surface is taken from
+    _, nearest = KDTree(mesh.vertices).query(places, k=neighbours, workers=numba.get_num_threads())
     across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
     result = np.full(shape, np.nan)
     result[k, j, i] = across.mean(axis=1)

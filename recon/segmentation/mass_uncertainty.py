@@ -23,7 +23,6 @@ from recon.segmentation.mass_surface import Mass
 
 Array = NDArray[np.float64]
 
-NEAR_MM = 1.0  # of a B-scan's plane: a point there is shown by it
 BORDER_MM = (
     0.06  # standard deviation of a border's place as a whole, along each axis and outwards, by speckle; see docs/freehand.md
 )
@@ -101,13 +100,14 @@ def shown_by(points: Array, scans: Scans) -> Shown:
     size = np.array(scans.shape[::-1])
     pairs, pixels = [], []
     nearest, closest, seen = np.full((len(points), 3), np.nan), np.full(len(points), np.inf), np.zeros(len(points), bool)
+    near_mm = 1.0  # of a B-scan's plane: a point there is shown by it
     for k in np.flatnonzero(np.isfinite(scans.world_from_pixel).all(axis=(1, 2))).tolist():
         world_from_pixel = scans.world_from_pixel[k]
         local = rigid.apply(np.linalg.inv(world_from_pixel), points)
         away = np.abs(local[:, 2]) * np.linalg.norm(world_from_pixel[:3, 2])
         beside = np.maximum(np.maximum(-0.5 - local[:, :2], local[:, :2] - (size - 0.5)), 0)
         away = np.hypot(away, np.linalg.norm(beside * np.linalg.norm(world_from_pixel[:3, :2], axis=0), axis=1))
-        shown, closer = (beside == 0).all(axis=1) & (away < NEAR_MM), away < closest
+        shown, closer = (beside == 0).all(axis=1) & (away < near_mm), away < closest
         pairs.append(np.column_stack([np.flatnonzero(shown), np.full(shown.sum(), k)]))
         pixels.append(local[shown, :2])
         nearest[closer], closest[closer] = np.column_stack([np.full(closer.sum(), k), local[closer, :2]]), away[closer]

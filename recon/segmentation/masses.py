@@ -28,7 +28,6 @@ Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SPACING_MM = (0.5, 0.25, 0.5)  # along the array, the beam and across; a border square to the beam is a line of its pulse
-BESIDE_MM = 0.25  # half of the widest voxel
 REFINEMENTS = (2, 3)  # after each clearing
 
 
@@ -332,7 +331,8 @@ def _blurred(field: Map, sigma: Array) -> Map:
 def _opened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """The voxels of a mask that lie in balls which fit into it, or no more than `BESIDE_MM` away."""
     core = ~_widened(~mask, radius_mm, spacing)
-    return mask & _widened(core, radius_mm + BESIDE_MM, spacing)
+    beside_mm = 0.25  # half of the widest voxel
+    return mask & _widened(core, radius_mm + beside_mm, spacing)
 
 
 def _widened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:

@@ -23,7 +23,6 @@ from recon.segmentation.refraction import Sound, follow
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-CLEAR_MM = 2.0  # from a border, where pixels show one tissue only
 DEPTH_BINS, PATH_BINS = 60, 40  # of 1 mm
 
 
@@ -68,13 +67,15 @@ def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, f
     thinned = 4  # pixels, columns and rows, of which one counts for the losses
     rows = slice(recording.clip.v, None, thinned)
 
+    clear_mm = 2.0  # from a border, where pixels show one tissue only
+
     def binned(scan: tuple[NDArray[np.uint8], Array]) -> tuple[NDArray[np.int64], Array]:
         image, matrix = scan
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         u, v, within, passed = (a[rows] for a in (lines.u, lines.v, lines.within, lines.passed))
         power = table[image[rows, ::thinned]]
         away = _sampled(inside, matrix, u, v)
-        used = (away > CLEAR_MM) & (away < FAR_MM - 0.2) & (passed > 0.5)
+        used = (away > clear_mm) & (away < FAR_MM - 0.2) & (passed > 0.5)
         bins = np.minimum(v[used] * scale[1], DEPTH_BINS - 1).astype(int) * PATH_BINS
         return bins + np.minimum(within[used], PATH_BINS - 1).astype(int), power[used] / passed[used]
 

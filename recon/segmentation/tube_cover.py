@@ -17,13 +17,6 @@ from recon.geometry.primitives import Cylinder, Fit, fit_cylinder
 
 Array = NDArray[np.float64]
 
-HALF_ARC_DEG = 75.0  # about the tube's axis, on either side of the direction to the camera
-LEAST_POINTS = 1000
-MOST_POINTS = 100_000  # evenly chosen; more would change the radius by less than a micrometre
-OUTLIER = 4.0  # standard deviations, by the median absolute deviation
-ROUNDS = 3
-LEAST_ARC_DEG = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
-
 
 @dataclass(frozen=True)
 class Cover:
@@ -49,9 +42,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
         If too little surface lies before the tube, it isn't round, or the tube isn't within it.
     """
     points = before(np.asarray(surface.vertices, float), tube, ends)
-    if len(points) < LEAST_POINTS:
-        raise InputError(f"surface: expected {LEAST_POINTS} points before the tube, found {len(points)}; another session?")
-    points = points[:: -(-len(points) // MOST_POINTS)]
+    least_points = 1000
+    if len(points) < least_points:
+        raise InputError(f"surface: expected {least_points} points before the tube, found {len(points)}; another session?")
+    most_points = 100_000  # evenly chosen; more would change the radius by less than a micrometre
+    points = points[:: -(-len(points) // most_points)]
     try:
         fit, points = _robust(points)
     except (ValueError, np.linalg.LinAlgError):
@@ -60,10 +55,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
     arc = arc_deg(points, fit.shape)
     most_turn_deg = 20.0  # between both axes
     most_rms_mm = 0.3  # of the points about the cylinder: light is ten times as exact
+    least_arc_deg = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
     wrong = {
         f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > most_rms_mm,
         f"a cylinder turned by {turn:.0f} deg against the tube": turn > most_turn_deg,
-        f"an arc of {arc:.0f} deg": arc < LEAST_ARC_DEG,
+        f"an arc of {arc:.0f} deg": arc < least_arc_deg,
     }
     found = [text for text, holds in wrong.items() if holds]
     if found:
@@ -74,9 +70,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
 def _robust(points: Array) -> tuple[Fit[Cylinder], Array]:
     """Cylinder through points : (n, 3) mm, and those near it."""
     fit = fit_cylinder(points)
-    for _ in range(ROUNDS):
+    outlier = 4.0  # standard deviations, by the median absolute deviation
+    rounds = 3
+    for _ in range(rounds):
         away = np.abs(fit.residuals - np.median(fit.residuals))
-        points = points[away < OUTLIER * NORMAL_MAD * np.median(away) + 1e-9]
+        points = points[away < outlier * NORMAL_MAD * np.median(away) + 1e-9]
         fit = fit_cylinder(points)
     return fit, points
 
@@ -86,7 +84,8 @@ def before(points: Array, tube: Cylinder, ends: Array) -> Array:
     local = points - tube.point
     along, (first, last) = local @ tube.axis, np.sort((ends - tube.point) @ tube.axis)
     across = local - np.outer(along, tube.axis)
-    facing = across @ to_camera(tube) > np.cos(np.deg2rad(HALF_ARC_DEG)) * np.linalg.norm(across, axis=1)
+    half_arc_deg = 75.0  # about the tube's axis, on either side of the direction to the camera
+    facing = across @ to_camera(tube) > np.cos(np.deg2rad(half_arc_deg)) * np.linalg.norm(across, axis=1)
     return points[facing & (along > first) & (along < last)]
 
 

@@ -27,17 +27,8 @@ from recon.segmentation.echo_power import SPREAD_MM
 
 Array = NDArray[np.float64]
 
-TRIALS = 400  # circles through three first echoes
-NEAR_MM = 0.5  # from a circle, of the first echoes that count for it
-LEAST_ARC_DEG = 70.0  # of first echoes; less leaves the radius to chance
-HALF_ARC_DEG = 85.0  # of rays, on either side of the wall's front
-WINDOW_MM = 1.2  # along a ray, on either side of the rough circle, and
-OUTLIER = 3.5  # standard deviations from the smooth outline
-CLIPPED = 250.0  # grey level of 255, from which an echo's brightness isn't known
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
-ROBUST = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
-SEED = 0  # of the trials: the same image gives the same ring
 
 
 @dataclass(frozen=True)
@@ -100,8 +91,9 @@ def find(image: NDArray, scale: Array, appearance: Appearance | None = None) -> 
     if near is None:
         return _none(f"no arc of {look.diameter_mm[0]:g} to {look.diameter_mm[1]:g} mm in diameter")
     directions = np.arctan2(first[near, 0] - circle[0], circle[1] - first[near, 1])
-    if np.ptp(directions) < np.deg2rad(LEAST_ARC_DEG):
-        return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {LEAST_ARC_DEG:.0f}")
+    least_arc_deg = 70.0  # of first echoes; less leaves the radius to chance
+    if np.ptp(directions) < np.deg2rad(least_arc_deg):
+        return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {least_arc_deg:.0f}")
     ring = _measured(level, scale, circle, look, grey)
     centrings = 3
     for _ in range(centrings):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
@@ -179,9 +171,11 @@ def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array
 
 def _rough_circle(points: Array, diameter: tuple[float, float]) -> tuple[Array, NDArray[np.bool_] | None]:
     """Circle x, y, radius with most of the points on its front side, and these points; None without one of the size."""
-    rng = np.random.default_rng(SEED)
+    seed = 0  # of the trials: the same image gives the same ring
+    rng = np.random.default_rng(seed)
     best, chosen, count = np.zeros(3), None, 9
-    for _ in range(TRIALS):
+    trials = 400  # circles through three first echoes
+    for _ in range(trials):
         three = points[rng.choice(len(points), 3, replace=False)]
         circle = _algebraic(three)
         if circle is None or not diameter[0] <= 2 * circle[2] <= diameter[1]:
@@ -198,7 +192,8 @@ def _rough_circle(points: Array, diameter: tuple[float, float]) -> tuple[Array, 
 
 def _on_front(points: Array, circle: Array) -> NDArray[np.bool_]:
     away = points - circle[:2]
-    return (np.abs(np.hypot(*away.T) - circle[2]) < NEAR_MM) & (away[:, 1] < NEAR_MM)
+    near_mm = 0.5  # from a circle, of the first echoes that count for it
+    return (np.abs(np.hypot(*away.T) - circle[2]) < near_mm) & (away[:, 1] < near_mm)
 
 
 def _algebraic(points: Array) -> Array | None:
@@ -211,10 +206,12 @@ def _algebraic(points: Array) -> Array | None:
 def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: Appearance, grey: float) -> Ring:
     """Edges along rays from the rough centre, less those off a smooth outline, with their scatter about it."""
     step_deg = 1.0  # between rays
-    angle = np.deg2rad(np.arange(-HALF_ARC_DEG, HALF_ARC_DEG + step_deg / 2, step_deg))
+    half_arc_deg = 85.0  # of rays, on either side of the wall's front
+    angle = np.deg2rad(np.arange(-half_arc_deg, half_arc_deg + step_deg / 2, step_deg))
     rays = np.column_stack([np.sin(angle), -np.cos(angle)])
     window_spreads = 3.0  # times the spread along the array
-    window = WINDOW_MM + window_spreads * look.spread_mm[0]
+    window_mm = 1.2  # along a ray, on either side of the rough circle, and
+    window = window_mm + window_spreads * look.spread_mm[0]
     sample_mm = 0.02
     along = np.arange(max(circle[2] - window, 0.3 * circle[2]), circle[2] + window, sample_mm)
     places = (circle[:2] + rays[:, None] * along[:, None]) / scale
@@ -231,7 +228,8 @@ def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: App
     angle, rays = angle[good], rays[good]
     radius, extent = along[0] + sample_mm * middle[good], sample_mm * extent[good]
     outline, scatter = _smooth_outline(angle, radius, extent)
-    kept = np.abs(radius - outline) < OUTLIER * scatter * extent + FLOOR_MM
+    outlier = 3.5  # standard deviations from the smooth outline
+    kept = np.abs(radius - outline) < outlier * scatter * extent + FLOOR_MM
     if kept.sum() < LEAST_EDGES:
         return _none(f"too few edges: {kept.sum()} of {len(kept)} on a smooth outline")
     peaks = profiles[good][kept].max(axis=1)
@@ -271,7 +269,8 @@ def _slopes(angle: Array, peaks: Array) -> Array:
 
     Where levels are clipped the slope is taken to change evenly between both ends, as on the crest of a mirror's echo.
     """
-    known = peaks < CLIPPED
+    clipped = 250.0  # grey level of 255, from which an echo's brightness isn't known
+    known = peaks < clipped
     if known.sum() < LEAST_EDGES:
         return np.zeros_like(peaks)
     at, level = angle[known], peaks[known]
@@ -313,9 +312,10 @@ def _weighted(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tu
     begin = np.array([0, 0, 0, 0, start.radius])
     normal = away(begin)[1]
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, covariance, normal) + FLOOR_MM**2)
-    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=ROBUST)
+    robust = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
+    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=robust)
     bread = np.linalg.inv(result.jac.T @ result.jac)
-    gradients = _gradients(result.jac, result.fun, ROBUST)
+    gradients = _gradients(result.jac, result.fun, robust)
     scores = np.stack([gradients[frames == k].sum(axis=0) for k in np.unique(frames)])
     variance = bread @ (scores.T @ scores) @ bread * len(scores) / max(len(scores) - 1, 1)
     axis = start.axis + result.x[2:4] @ across

@@ -14,13 +14,13 @@ from recon.skin_projection.projector_image import Lines
 from recon.skin_projection.skin_curve import SkinCurve
 
 SCHEMA = "sonotwin-curves/1"
-DIGITS = 4  # of mm
 
 
 def write_json(path: Path, curves: Sequence[SkinCurve]) -> None:
     """Write points of curves in mm of the world, a list for each piece that lies on the skin; whole or not at all."""
+    digits = 4  # of mm
     listed = [
-        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, DIGITS).tolist() for piece in pieces(curve.points)]}
+        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, digits).tolist() for piece in pieces(curve.points)]}
         for curve in curves
     ]
     content = {"schema": SCHEMA, "unit": "mm", "frame": "camera 1", "curves": listed}

@@ -15,8 +15,6 @@ from recon.skin_projection.skin_curve import SkinCurve
 
 Image = NDArray[np.uint8]
 
-PLAIN = 128  # grey of a skin that carries none
-
 
 def expected(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camera: Camera, lines: Lines) -> Image:
     """Grey view : (h, w) of the skin's vertices, in their own grey where they carry one, and of what is lit of the curves."""
@@ -27,7 +25,8 @@ def expected(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camer
     u, v = pixels[within].astype(int).T
     greys = meshes.greys_of(skin)
     dimmed = 0.5  # of the skin's grey, so that lines stand out
-    view[v, u] = dimmed * (PLAIN if greys is None else greys[within])
+    plain = 128  # grey of a skin that carries none
+    view[v, u] = dimmed * (plain if greys is None else greys[within])
     filled = np.where(view == 0, cv2.dilate(view, np.ones((3, 3), np.uint8)), view)  # between vertices that are farther apart
     seen = projector_image.in_sight(curves, skin, camera)
     both = {name: points & seen[name] for name, points in lit.items()}

@@ -20,10 +20,6 @@ from recon.skin_projection.skin_curve import SkinCurve
 
 Array = NDArray[np.float64]
 
-MOST_CELLS = 600  # of it along an axis, for large masses
-SMOOTHING = 1.5  # cells; moves a border of radius r inwards by (1.5 * 0.05 mm)^2 / 2r, 0.001 mm at 3 mm
-MARGIN = 8  # cells around
-
 
 def outlines(
     masses: Mapping[str, trimesh.Trimesh], skin: trimesh.Trimesh, eye_mm: ArrayLike | None = None
@@ -103,12 +99,15 @@ def outline(mass: trimesh.Trimesh, sight: Sight) -> Array:
     places = sight.chart(mass.vertices)[:, :2]
     low, high = places.min(axis=0), places.max(axis=0)
     finest_mm = 0.05  # of the grid
-    pitch = max(finest_mm, float((high - low).max()) / MOST_CELLS)
-    columns, rows = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * MARGIN).tolist()
-    first = low - MARGIN * pitch
+    most_cells = 600  # of it along an axis, for large masses
+    pitch = max(finest_mm, float((high - low).max()) / most_cells)
+    margin = 8  # cells around
+    columns, rows = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin).tolist()
+    first = low - margin * pitch
     grid = first + pitch * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     region = covered(sight, grid, mass).reshape(rows, columns)
-    borders = find_contours(gaussian_filter(region.astype(np.float32), SMOOTHING), 0.5)
+    smoothing = 1.5  # cells; moves a border of radius r inwards by (1.5 * 0.05 mm)^2 / 2r, 0.001 mm at 3 mm
+    borders = find_contours(gaussian_filter(region.astype(np.float32), smoothing), 0.5)
     if not borders:
         raise InputError(f"masses: expected closed bodies, found one of {(high - low).max():.2g} mm that no line of sight meets")
     outer = max(borders, key=lambda border: abs(_area(border)))

@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 
 LPS_FROM = {"LPS": np.ones(3), "RAS": np.array([-1.0, -1.0, 1.0])}
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # mm: nothing of the rig is farther away than ten metres
-FINE = 20  # points of a spline from one control point to the next
 
 
 class ControlPoint(BaseModel):
@@ -92,4 +91,5 @@ def _spline(points: Array, closed: bool) -> Array:
     """A cubic spline over the chords' lengths through points : (n, 3)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     spline = CubicSpline(along, points, bc_type="periodic" if closed else "natural")
-    return spline(np.interp(np.arange((len(points) - 1) * FINE + 1) / FINE, np.arange(len(points)), along))
+    fine = 20  # points of a spline from one control point to the next
+    return spline(np.interp(np.arange((len(points) - 1) * fine + 1) / fine, np.arange(len(points)), along))

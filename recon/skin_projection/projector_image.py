@@ -24,7 +24,6 @@ Image = NDArray[np.uint8]
 Length = Annotated[float, Field(ge=0.5, le=100)]
 
 FINE = 8  # parts of a pixel along each axis, by which its coverage is counted
-SHIFT = 4  # binary digits behind the point, of corners for OpenCV
 
 
 @dataclass(frozen=True)
@@ -148,8 +147,9 @@ def coverage(corners: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     columns, rows = (high - low + 1).tolist()
     fine = np.zeros((rows * FINE, columns * FINE), np.uint8)
     inner = (corners - low + 0.5) * FINE - 0.5
-    for corner in np.rint(inner * 2**SHIFT).astype(np.int32):
-        cv2.fillConvexPoly(fine, corner, 255, shift=SHIFT)
+    shift = 4  # binary digits behind the point, of corners for OpenCV
+    for corner in np.rint(inner * 2**shift).astype(np.int32):
+        cv2.fillConvexPoly(fine, corner, 255, shift=shift)
     share = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
     result[low[1] : high[1] + 1, low[0] : high[0] + 1] = share.astype(np.float32) / 255
     return result

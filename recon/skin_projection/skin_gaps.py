@@ -15,7 +15,6 @@ from recon.skin_projection.lines_of_sight import Sight
 Array = NDArray[np.float64]
 
 OPEN = np.deg2rad(100)  # widest sector about the hole without skin
-FEWEST = 50  # vertices around
 
 
 def bridged(points: Array, chain: Array, sight: Sight, skin: trimesh.Trimesh) -> Array:
@@ -62,7 +61,8 @@ def _patch(places: Array, charted: Array) -> tuple[Array, float] | None:
     reach = np.linalg.norm(places - middle, axis=1).max() + around_mm
     off = charted[:, :2] - middle
     near = np.einsum("ij,ij->i", off, off) < reach**2
-    if np.count_nonzero(near) < FEWEST:
+    fewest = 50  # vertices around
+    if np.count_nonzero(near) < fewest:
         return None
     angles = np.sort(np.arctan2(off[near, 1], off[near, 0]))
     if np.diff(angles, append=angles[0] + 2 * np.pi).max() > OPEN:

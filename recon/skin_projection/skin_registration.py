@@ -23,9 +23,7 @@ Array = NDArray[np.float64]
 VERTICES = 60_000  # of a skin, evenly chosen
 PATCH = 40  # of them in a patch: some 3 mm about its middle, on a breast
 OVERLAP = 3  # patches that a vertex is in
-ROUNDS = 60
 SETTLED = np.array([1e-7] * 3 + [1e-5] * 3)  # step, rad and mm, after which it is done
-LEAST_SHARE = 0.4  # of the patches with a partner
 APART = PATCH // OVERLAP  # vertices from the middle of a patch to that of the next
 # Variance of Tukey's estimate over `variance * inv(squares)`, of normal errors: E[(w r)^2] / E[d(w r)/dr]^2 = 1.053 by 0.905 of
 # E[w r^2] / E[w]^2 [Huber 1981, 7.6].
@@ -74,13 +72,15 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
     tree, pose, reach = surface_tree(after.middles), np.eye(4), first_mm
     widths = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % efficient for normal errors
     least_turn = 0.8  # cosine between the normals of partners
-    for _ in range(ROUNDS):
+    rounds = 60
+    least_share = 0.4  # of the patches with a partner
+    for _ in range(rounds):
         moved, turned = rigid.apply(pose, before.middles), rigid.rotate(pose, before.normals)
         distance, nearest = tree.query(moved)
         others = after.normals[nearest]
         paired = (distance < reach) & ((others * turned).sum(axis=1) > least_turn)
         share = float(paired.mean())
-        if share < LEAST_SHARE:
+        if share < least_share:
             raise InputError(
                 f"skin: expected the earlier skin, moved by up to {first_mm:g} mm, found {share:.0%} of it on the new one: "
                 "is it another body, or did it move farther? then find the masses anew"

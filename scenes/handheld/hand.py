@@ -16,7 +16,6 @@ from scenes.handheld.mesh_parts import Part
 Array = NDArray[np.float64]
 
 VOXEL_MM = 3.5  # some 13 000 triangles a hand
-REACH_MM = 14.0  # how far from a capsule its distance matters to the smooth minimum
 SEGMENTS_MM = np.array([[46, 27, 22], [50, 31, 23], [46, 28, 23], [36, 21, 20]], float)  # index to little finger of an adult
 RADII_MM = np.array([9.2, 9.4, 8.8, 7.8])  # of the fingers at their roots
 THUMB_MM = np.array([34.0, 28.0])
@@ -173,9 +172,10 @@ def skin(hand: Skeleton, arm_mm: float, voxel: float = VOXEL_MM) -> trimesh.Trim
     low = np.min([np.minimum(b.start, b.end) - max(b.radii) for b in hand.bones], axis=0) - 2 * voxel
     high = np.max([np.maximum(b.start, b.end) + max(b.radii) for b in hand.bones], axis=0) + 2 * voxel
     shape = np.ceil((high - low) / voxel).astype(int) + 1
-    field = np.full(shape, REACH_MM, np.float32)
+    reach_mm = 14.0  # how far from a capsule its distance matters to the smooth minimum
+    field = np.full(shape, reach_mm, np.float32)
     for bone in hand.bones:
-        margin = max(bone.radii) + REACH_MM
+        margin = max(bone.radii) + reach_mm
         first = np.maximum(np.floor((np.minimum(bone.start, bone.end) - margin - low) / voxel).astype(int), 0)
         last = np.minimum(np.ceil((np.maximum(bone.start, bone.end) + margin - low) / voxel).astype(int) + 1, shape)
         here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))

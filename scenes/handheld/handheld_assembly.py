@@ -23,7 +23,6 @@ from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, d
 
 Array = NDArray[np.float64]
 
-TRIES = 40  # of a housing that stands clear of the board
 BEHIND_MM = 1e-3  # from the board's middle: a probe behind it is beside it in no direction
 IMAGE_FROM_BODY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the body's z is against the image's depth
 
@@ -108,7 +107,8 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
 
 def _clear_of(board: Board, rng: np.random.Generator, target_from_body: Array, array_mm: float) -> Body:
     """A housing for an array that doesn't pierce the board; InputError if none is found."""
-    for _ in range(TRIES):
+    tries = 40  # of a housing that stands clear of the board
+    for _ in range(tries):
         housing = scaled(body(rng), array_mm)
         levels = np.linspace(0, 1, 40)
         rings = np.concatenate([housing.outline_at(level) + np.array([0, 0, level * housing.length]) for level in levels])

@@ -14,9 +14,7 @@ from scenes.handheld.mesh_parts import Part
 
 Array = NDArray[np.float64]
 
-MARGIN_MM = 3.0  # of white around each disc, at least
 CLEAR_MM = 1.0  # between a disc and what is not to cover it
-SOFT = 0.6  # of a finger's radius: what gives way where it is pressed against the board
 
 
 @dataclass(frozen=True)
@@ -43,7 +41,8 @@ def draw_front(rng: np.random.Generator, target: Target, spread: float) -> tuple
 
     spread : largest relative change of each side.
     """
-    room = target.outer_diameter_mm / 2 + MARGIN_MM
+    margin_mm = 3.0  # of white around each disc, at least
+    room = target.outer_diameter_mm / 2 + margin_mm
     needed_low, needed_high = -room * np.ones(2), circle_layout.extent(target) + room
     size = np.maximum(np.array(target.board_mm) * rng.uniform(1 - spread, 1 + spread, 2), needed_high - needed_low)
     low = needed_high - size + rng.beta(1.5, 1.5, 2) * (needed_low - needed_high + size)
@@ -104,4 +103,5 @@ def pierces(points: Array, board: Board) -> bool:
     """Whether any ball : (n, 4) of x, y, z, radius touches the board."""
     low, high = np.array([*board.low, -board.thickness]), np.array([*board.high, 0.0])
     away = np.maximum(np.maximum(low - points[:, :3], points[:, :3] - high), 0)
-    return bool((np.linalg.norm(away, axis=1) < SOFT * points[:, 3]).any())
+    soft = 0.6  # of a finger's radius: what gives way where it is pressed against the board
+    return bool((np.linalg.norm(away, axis=1) < soft * points[:, 3]).any())

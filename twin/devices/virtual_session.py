@@ -20,8 +20,6 @@ from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import CameraName
 from twin.tracking.sampling_ranges import DataRanges
 
-PATIENCE = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
-
 
 @dataclass(frozen=True)
 class StillDevices:
@@ -66,7 +64,8 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
         raise InputError("board.kind: expected asymmetric_circles, dark ones, as the twin prints no others, found another board")
     printed = board.Config(**design.model_dump(exclude={"kind", "white", "unusual"}))
     held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
-    return _devices(settings, held, BoardHand(held.hold, PATIENCE * count))
+    patience = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
+    return _devices(settings, held, BoardHand(held.hold, patience * count))
 
 
 def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:

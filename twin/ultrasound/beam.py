@@ -30,8 +30,6 @@ Complex = NDArray[np.complex64]
 
 NEAREST_MM = 2.0  # where the beam at the face is taken; Fresnel's approximation fails nearer
 OVERSAMPLING = 2  # axial samples a row of the image
-EDGES = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
-REACH_MM = 4.0  # of the point spread along the array, at most
 STEP_MM = 0.025  # of the elevational table
 BAND = np.linspace(-1.1, 1.1, 23)  # frequencies of an echo, in its full widths at half amplitude beside the centre
 DEEPER = 1.2  # true depth that the tables reach, over the shown one
@@ -93,7 +91,8 @@ def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
 
 def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
     lines, wavelength = lines_of(transducer), transducer.wavelength_mm
-    taps = int(REACH_MM / lines.pitch_mm)
+    reach_mm = 4.0  # of the point spread along the array, at most
+    taps = int(reach_mm / lines.pitch_mm)
     transmit = transducer.transmit_focus_mm / transducer.transmit_f_number
     table = np.empty((len(rows), taps + 1), complex)
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
@@ -134,7 +133,8 @@ def _elevation(transducer: Transducer, depths: Array) -> tuple[NDArray[np.comple
         wavelengths = transducer.wavelength_mm / np.maximum(1 + share, 0.2)
         table[k] = weight @ through_lens(offsets, depth, height, focus, wavelengths) ** 2 / height
     level = np.abs(table) / np.abs(table).max(axis=1, keepdims=True)
-    half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in EDGES)
+    edges = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
+    half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in edges)
     return table, half, core
 
 

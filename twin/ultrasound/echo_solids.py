@@ -25,8 +25,6 @@ from twin.conditions import Sound
 
 Array = NDArray[np.float64]
 
-SPACING_MM = (0.5, 1.0)  # of the grids, of small and of large solids
-MOST_POINTS = 3e8  # of a grid
 MARGIN_MM = 3.0  # of the grids, around the solid
 
 FIRST, NX, NY, NZ = range(4)  # columns of `Solids.grid`
@@ -166,7 +164,8 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
 
 def _spacing(thing: Thing) -> float:
     large_mm = 60.0  # greatest extent of a small one
-    return SPACING_MM[int(thing.mesh.extents.max() > large_mm)]
+    spacing_mm = (0.5, 1.0)  # of the grids, of small and of large solids
+    return spacing_mm[int(thing.mesh.extents.max() > large_mm)]
 
 
 def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
@@ -179,8 +178,9 @@ def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
 
 
 def _check_count(name: str, counts: Array) -> None:
-    if (points := np.prod(counts.astype(float))) > MOST_POINTS:
-        raise InputError(f"scene: {name}: expected a thing whose grid has up to {MOST_POINTS:g} points, found {points:.2g}")
+    most_points = 3e8  # of a grid
+    if (points := np.prod(counts.astype(float))) > most_points:
+        raise InputError(f"scene: {name}: expected a thing whose grid has up to {most_points:g} points, found {points:.2g}")
 
 
 def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:

@@ -31,7 +31,6 @@ POSES = "sweep.npz"  # in the sweep's own folder of truth
 LABELS = "labels"
 PURPOSES: dict[str, Purpose] = {"wire": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
 SUPPORTS = ("table", "tank")  # what things lie on or in
-GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
 
 
 def plan_sweep(
@@ -55,11 +54,12 @@ def plan_sweep(
     """
     shaken = conditions.trembling(errors, seed)
     path_seed, clock_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
+    gives_mm = 5.0  # by which a surface gives way to the probe, at most
     match path:
         case SurfacePath():
             course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            refuse_inside(course, body, transducer, GIVES_MM)
+            refuse_inside(course, body, transducer, gives_mm)
         case Bob():
             course = bobbing(path, transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)

@@ -21,8 +21,6 @@ log = logging.getLogger(__name__)
 
 MOST_WAITING = 64  # messages that nobody has fetched yet; beyond, the oldest are lost
 MOST_WAITING_BYTES = 128 << 20
-PIECE = 1 << 18  # bytes that are read at once
-LOOK_S = 0.2  # between two looks at whether to end
 AGAIN_S = 1.0  # after a lost connection
 
 
@@ -112,8 +110,10 @@ class Client:
     def _listen(self, complaints: Complaints) -> None:
         """Connect, and read until the connection ends."""
         connect_s = 5.0
+        piece = 1 << 18  # bytes that are read at once
+        look_s = 0.2  # between two looks at whether to end
         with socket.create_connection(self._address, connect_s) as connection:
-            connection.settimeout(LOOK_S)
+            connection.settimeout(look_s)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             for message in self._first:
@@ -123,7 +123,7 @@ class Client:
             splitter, pace = self._splitter(), Pace()
             while not self._ends.is_set():
                 with suppress(TimeoutError):
-                    self._read(connection.recv(PIECE), splitter, pace, complaints)
+                    self._read(connection.recv(piece), splitter, pace, complaints)
 
     def _read(self, data: bytes, splitter: Splitter, pace: Pace, complaints: Complaints) -> None:
         if not data:

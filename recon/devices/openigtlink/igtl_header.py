@@ -22,7 +22,6 @@ ASCII, UTF8 = 3, 106
 SECOND = 10**9  # ns
 MOST_NAME_BYTES = 20  # of a device
 MOST_BODY_BYTES = 64 << 20  # a volume of 64 MB; a live image has less than 10
-FARTHEST_MM = 1e9
 KIND = re.compile(rb"[A-Za-z0-9_]{1,12}\0*")
 
 
@@ -145,8 +144,9 @@ def encoded(value: str) -> tuple[int, bytes]:
 
 def finite(numbers: NDArray) -> NDArray[np.float64]:
     """Numbers of a message, if all are some; InputError if not: what is none comes from senders that have no pose."""
-    if not (np.abs(numbers) < FARTHEST_MM).all():
-        raise InputError(f"expected finite numbers below {FARTHEST_MM:g}, found {short(str(numbers.ravel()[:12].tolist()))}")
+    farthest_mm = 1e9
+    if not (np.abs(numbers) < farthest_mm).all():
+        raise InputError(f"expected finite numbers below {farthest_mm:g}, found {short(str(numbers.ravel()[:12].tolist()))}")
     return numbers.astype(float)
 
 
