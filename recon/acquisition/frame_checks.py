@@ -66,13 +66,13 @@ def look(image: Images, bits: int) -> Look:
     """Measure brightness and edges of a frame : (h, w)."""
     full = 2**bits - 1
     level = float(np.percentile(image[::4, ::4], BRIGHTEST)) / full
-    widths = edge_widths(image)
+    widths = _edge_widths(image)
     if not widths:
         return Look(level, float(np.mean(image >= full)), np.nan, np.nan)
     return Look(level, float(np.mean(image >= full)), min(widths), float(np.sqrt(max(widths) ** 2 - min(widths) ** 2)))
 
 
-def edge_widths(image: Images) -> list[float]:
+def _edge_widths(image: Images) -> list[float]:
     """Standard deviations of edges in px, one a direction that has enough of them.
 
     A step of height H that is blurred by sigma has the largest gradient `H / (sigma sqrt(2 pi))`.

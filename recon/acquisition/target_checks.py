@@ -32,8 +32,3 @@ def target_judge(networks: Networks, target: Target) -> Judge:
         return text, (f"{' and '.join(covered)} partly covered; move hand and cable off the target",) if covered else ()
 
     return judge
-
-
-def unjudged(image: NDArray, bits: int) -> Judged:
-    """Say nothing, where no target is expected."""
-    return "", ()

@@ -19,13 +19,13 @@ def read(path: Path) -> Clip:
         If it is missing, damaged, or of another kind.
     """
     if path.is_dir():
-        return of_images(path)
+        return _of_images(path)
     if path.suffix.lower() in VIDEOS:
         return video_clip.read(path)
     return dicom_clip.read(path)
 
 
-def of_images(folder: Path) -> Clip:
+def _of_images(folder: Path) -> Clip:
     """A folder of images, all of one size; it has no times."""
     paths = image_files(folder)
     if not paths:

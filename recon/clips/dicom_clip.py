@@ -61,7 +61,7 @@ def read(path: Path) -> Clip:
 
 def _clip(path: Path) -> Clip:
     header = _dataset(path, stop_before_pixels=True)
-    check_compression(path, header.file_meta.get("TransferSyntaxUID"))
+    _check_compression(path, header.file_meta.get("TransferSyntaxUID"))
     count = int(header.get("NumberOfFrames") or 1)
     most_frames = 1_000_000
     if not 1 <= count <= most_frames:
@@ -69,7 +69,7 @@ def _clip(path: Path) -> Clip:
     size = int(header.Columns), int(header.Rows)
     if not 0 < size[0] * size[1] <= MOST_PX:
         raise ValueError(f"images of {size[0]}x{size[1]}")
-    seconds, region = times(header, count), b_scan_region(header)
+    seconds, region = times(header, count), _b_scan_region(header)
     image, scale = (None, None) if region is None else within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, size, count, timed, lambda: images(path, size, count), image, scale)
@@ -95,7 +95,7 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
         raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
 
 
-def check_compression(path: Path, syntax: UID | None) -> None:
+def _check_compression(path: Path, syntax: UID | None) -> None:
     """InputError if pixels are compressed in a way that can't be read here."""
     if syntax is None or not syntax.is_transfer_syntax or not syntax.is_encapsulated or syntax in LOSSLESS:
         return
@@ -192,7 +192,7 @@ def times(header: Dataset, count: int) -> NDArray[np.float64] | None:
     return np.arange(count) * (step if step > 0 else 1 / rate)
 
 
-def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
+def _b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
     """The largest two-dimensional region of tissue, and its scale in mm/px; None where the file has none."""
     best: tuple[Box, tuple[float, float] | None] | None = None
     two_d, tissue, centimetres = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits

@@ -25,7 +25,7 @@ PREFIX = "tag:yaml.org,2002:"
 Base: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class PlainLoader(Base):
+class _PlainLoader(Base):
     """Loader of null, true and false, numbers, texts, lists and maps: a date is a text, and keys of a map are different."""
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
@@ -47,16 +47,16 @@ class PlainLoader(Base):
         return super().construct_mapping(node, deep)
 
 
-PlainLoader.yaml_implicit_resolvers = {
+_PlainLoader.yaml_implicit_resolvers = {
     letter: [(tag, pattern) for tag, pattern in rules if tag.removeprefix(PREFIX) in PLAIN]
     for letter, rules in Base.yaml_implicit_resolvers.items()
 }
-PlainLoader.yaml_constructors = {
+_PlainLoader.yaml_constructors = {
     tag: make
     for tag, make in Base.yaml_constructors.items()
     if tag is None or tag.removeprefix(PREFIX) in PLAIN  # all others are refused by that of None
 }
-PlainLoader.add_constructor(f"{PREFIX}int", PlainLoader.construct_yaml_int)
+_PlainLoader.add_constructor(f"{PREFIX}int", _PlainLoader.construct_yaml_int)
 
 
 def read(path: Path, expected: str = "a file") -> Any:
@@ -75,7 +75,7 @@ def loaded(path: Path, text: str) -> Any:
     """Values of a YAML text that stood in a file; raises InputError as `read` does."""
     deque(events(path, text, MOST_VALUES), maxlen=0)
     try:
-        return yaml.load(text, Loader=PlainLoader)
+        return yaml.load(text, Loader=_PlainLoader)
     except FAULTS as error:
         raise _fault(path, error) from None
 
@@ -122,7 +122,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
 
 def _parsed(path: Path, text: str) -> Iterator[yaml.Event]:
     try:
-        yield from yaml.parse(text, Loader=PlainLoader)
+        yield from yaml.parse(text, Loader=_PlainLoader)
     except FAULTS as error:
         raise _fault(path, error) from None
 

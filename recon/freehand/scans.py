@@ -336,7 +336,7 @@ def cautions(scans: Scans) -> Iterator[str]:
     yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 
-def pixel_sides(scans: Scans) -> Array:
+def _pixel_sides(scans: Scans) -> Array:
     """Width and height : (2,) mm of a pixel, in the median; NaN without a pose."""
     placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
     return np.median(np.linalg.norm(placed[:, :3, :2], axis=1), axis=0) if len(placed) else np.full(2, np.nan)
@@ -345,10 +345,10 @@ def pixel_sides(scans: Scans) -> Array:
 def sides(scans: Scans, clip: Clip | None = None) -> list[float]:
     """Width and height of the B-scans, or of their part within a clip, mm."""
     left, right, top, bottom = (clip or Clip(0, 0, scans.shape[1], scans.shape[0])).bounds(scans.shape)
-    return (pixel_sides(scans) * [right - left + 1, bottom - top + 1]).tolist()
+    return (_pixel_sides(scans) * [right - left + 1, bottom - top + 1]).tolist()
 
 
-def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
+def _size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
     """Faults of the size of the B-scans, or of their part within a clip, and of their axes; none as a rule."""
     placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
     if not len(placed):
@@ -356,7 +356,7 @@ def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
     faults = []
     wrong = [fault for side in sides(scans, clip) if (fault := lengths.B_SCAN.fault(side))]
     if wrong:
-        same = np.abs(pixel_sides(scans) - 1).max() < 1e-6
+        same = np.abs(_pixel_sides(scans) - 1).max() < 1e-6
         cause = ", pixels of 1 mm: the identity in place of the probe's calibration?" if same else ""
         faults.append(f"sides of {lengths.B_SCAN}, found {wrong[0]}{cause}")
     if found := lengths.axes_fault(placed[0]):
@@ -372,7 +372,7 @@ def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implaus
     InputError
         If they are, and not to be taken.
     """
-    for fault in size_faults(scans, clip):
+    for fault in _size_faults(scans, clip):
         refuse_or_warn(place, f"B-scans: expected {fault}", implausible)
     if doubt := next(filter(None, map(lengths.B_SCAN.doubt, sides(scans, clip))), None):
         log.warning("%s: a side of the B-scans is %s", place, doubt)

@@ -47,7 +47,7 @@ class FusedScene:
     def path(self) -> Array:
         """Middles of the array's face : (m, 3) mm, of the B-scans with a pose."""
         placed = np.isfinite(self.scans.world_from_pixel).all(axis=(1, 2))
-        return faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
+        return _faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
 
 
 def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
@@ -80,10 +80,10 @@ def surface_layer(
 
 def scan_layer(image: NDArray[np.uint8], world_from_pixel: Array) -> trimesh.Trimesh:
     """A B-scan : (h, w) where it was taken, to the borders of its outer pixels."""
-    return pictured(scan_corners(image.shape[1], image.shape[0], world_from_pixel), image)
+    return pictured(_scan_corners(image.shape[1], image.shape[0], world_from_pixel), image)
 
 
-def scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
+def _scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
     """Outer corners : (4, 3) mm of a B-scan, from the upper left one on clockwise."""
     u, v = np.array([-0.5, width - 0.5, width - 0.5, -0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
     return rigid.apply(world_from_pixel, np.column_stack([u, v, np.zeros(4)]))
@@ -140,6 +140,6 @@ def evenly(numbers: list[int], count: int) -> list[int]:
     )
 
 
-def faces_middle(world_from_pixel: Array, width: int) -> Array:
+def _faces_middle(world_from_pixel: Array, width: int) -> Array:
     """Middles of the array's face : (n, 3) mm, from matrices : (n, 4, 4) of B-scans as wide as some px."""
     return world_from_pixel[:, :3, 0] * (width - 1) / 2 + world_from_pixel[:, :3, 3]

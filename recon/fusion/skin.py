@@ -42,14 +42,14 @@ def by_mask(surface: trimesh.Trimesh, mask: Mask, camera: Camera) -> Parted:
 
 def by_plane(surface: trimesh.Trimesh, seed: int = 0) -> Parted:
     """Part by the plane that things stand on; all of the surface is skin where there is none."""
-    plane = standing_plane(np.asarray(surface.vertices, float), seed)
+    plane = _standing_plane(np.asarray(surface.vertices, float), seed)
     if plane is None:
         return Parted(surface, None)
     before = plane.distance(np.asarray(surface.vertices, float)) > STANDS_MM
     return _parted(surface, _largest_piece(surface, before))
 
 
-def standing_plane(points: Array, seed: int = 0) -> Plane | None:
+def _standing_plane(points: Array, seed: int = 0) -> Plane | None:
     """The plane that things stand on, its normal towards the camera at the origin; None where there is none.
 
     points : (n, 3) mm

@@ -40,7 +40,7 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
     for name, path in voxels.items():
         shutil.copyfile(path, folder / f"{name}.nrrd")
     for k in evenly(list(scene.images), scans):
-        volumes.write_volume(folder / f"scan{k:04d}.nrrd", slice_of(scene, k))
+        volumes.write_volume(folder / f"scan{k:04d}.nrrd", _slice_of(scene, k))
     if scene.middle is not None and scene.scans.probe is not None:
         write_transform(folder / TRANSFORM, scene.world_from_target[scene.middle])
         body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
@@ -64,7 +64,7 @@ def models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
     yield from ((name, device_layer(camera)) for name, camera in scene.devices.items())
 
 
-def slice_of(scene: FusedScene, k: int) -> Volume:
+def _slice_of(scene: FusedScene, k: int) -> Volume:
     """B-scan k as a volume of one slice where it was taken."""
     matrix = scene.scans.world_from_pixel[k]
     lengths = np.linalg.norm(matrix[:3, :2], axis=0)

@@ -62,7 +62,7 @@ class SlicerPublisher:
         self._status = ""
         if scene.skin is not None:
             self._send_model(SKIN, scene.skin, RAS_FROM_LPS)
-        for name, mesh in zip(model_names(scene.masses), scene.masses.values(), strict=True):
+        for name, mesh in zip(_model_names(scene.masses), scene.masses.values(), strict=True):
             self._send_model(name, mesh, RAS_FROM_LPS)
         if scene.probe is not None:
             self._send_model(PROBE_BODY, scene.probe, np.eye(4))
@@ -78,7 +78,7 @@ class SlicerPublisher:
             self._sent = moment.scan
             taken = moment.scan.taken_ns + self._since_1970
             self._sender.image(SCAN, moment.scan.image, RAS_FROM_LPS @ moment.scan.world_from_pixel, taken)
-            self._sender.text(DISTANCES, distances_line(moment), taken)
+            self._sender.text(DISTANCES, _distances_line(moment), taken)
         if moment.status != self._status:
             self._status = moment.status
             self._sender.text(STATUS, self._status, now)
@@ -91,7 +91,7 @@ class SlicerPublisher:
         self._sender.model(name, rigid.apply(ras_from_mesh, np.asarray(mesh.vertices)), np.asarray(mesh.faces, np.int64))
 
 
-def model_names(masses: Iterable[str]) -> list[str]:
+def _model_names(masses: Iterable[str]) -> list[str]:
     """Names of masses as Slicer gets them: short enough for a message, and distinct from each other and from what else is sent.
 
     A name that isn't sent as it is but for a capital is logged.
@@ -115,6 +115,6 @@ def _shortened(name: str, end: str = "") -> str:
     return name.encode()[: MOST_NAME_BYTES - len(end)].decode(errors="ignore") + end
 
 
-def distances_line(moment: Moment) -> str:
+def _distances_line(moment: Moment) -> str:
     """Distances of the B-scan's plane from the masses, as one line."""
     return "; ".join(f"{each.name} {each.distance_mm:.1f} mm{', cut' * each.cut}" for each in moment.distances)

@@ -75,7 +75,7 @@ def by_all(mass: Mass, scans: Scans, speeds: Speeds, under: Containment | None =
     if scans.probe is None or scans.probe.uncertainty is None:
         return Sigma(np.nan, np.nan)
     weights, shown = weights_of(mass, under), shown_by(np.asarray(mass.mesh.vertices), scans)
-    covariance = by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + by_border(mass, under)
+    covariance = _by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + _by_border(mass, under)
     centre, volume, depth = np.trace(covariance[:3, :3]), covariance[3, 3], covariance[4, 4]
     depth = np.nan if under is None or not np.isfinite(under.least_mm) else depth
     return Sigma(*np.sqrt([centre, volume, depth]).tolist())
@@ -118,7 +118,7 @@ def shown_by(points: Array, scans: Scans) -> Shown:
     return Shown(vertex, scan, pixel, 1 / np.bincount(vertex, minlength=len(points))[vertex])
 
 
-def by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
+def _by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
     """Covariance : (5, 5) of centre, volume and depth by what places the B-scans."""
     probe, errors = scans.probe, scans.errors
     assert probe is not None and probe.uncertainty is not None
@@ -148,7 +148,7 @@ def by_speeds(mass: Mass, weights: Weights, shown: Shown, scans: Scans, speeds: 
     return np.outer(by_tissue, by_tissue) * speeds.tissue**2 + np.outer(by_within, by_within) * speeds.within**2
 
 
-def by_border(mass: Mass, under: Containment | None) -> Array:
+def _by_border(mass: Mass, under: Containment | None) -> Array:
     """Covariance : (5, 5) of centre, volume and depth by the border's own scatter, and the skin's."""
     skin_mm = 0.0 if under is None else under.sigma_mm
     return np.diag([BORDER_MM, BORDER_MM, BORDER_MM, BORDER_MM * mass.mesh.area, np.hypot(BORDER_MM, skin_mm)]) ** 2

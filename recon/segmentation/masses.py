@@ -101,7 +101,7 @@ def from_scans(
     shape = arguments.image_size("shape", shape)
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     sound = sound or Sound()
-    clip = below_face(shape, world_from_pixel)
+    clip = _below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
     spread_mm = blur.lateral_mm if blur else 0.0
@@ -112,14 +112,14 @@ def from_scans(
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            masses = refined([mass for mass in masses if is_dark(mass, power)], power, times)
+            masses = refined([mass for mass in masses if _is_dark(mass, power)], power, times)
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     return sorted(masses, key=lambda mass: -mass.volume)
 
 
-def below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
+def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
     """The part of images (h, w) below the ringing at the face; InputError if there is none."""
     top_mm = 3.0  # ringing at the face, left out
     top = int(np.ceil(top_mm / pixel_mm(world_from_pixel)[1]))
@@ -138,7 +138,7 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     InputError
         If these are black: gel, a standoff, or water.
     """
-    top, placed = below_face(shape, world_from_pixel).v, np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2)))
+    top, placed = _below_face(shape, world_from_pixel).v, np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2)))
     sampled = 40  # images for the level of tissue
     chosen = set(placed[:: max(1, len(placed) // sampled)].tolist())
     sample = np.stack([image[top : shape[0] // 2] for k, image in enumerate(images) if k in chosen])
@@ -150,7 +150,7 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     return grey
 
 
-def is_dark(mass: Mass, power: EchoPower) -> bool:
+def _is_dark(mass: Mass, power: EchoPower) -> bool:
     """Whether a mass is still dark after the shadows of others have been taken away."""
     places = mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre)
     voxel = np.rint(rigid.apply(np.linalg.inv(power.volume.world_from_voxel), places)).astype(int)

@@ -52,7 +52,7 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
     except (ValueError, np.linalg.LinAlgError):
         raise InputError("surface: expected a round body about the tube, found no cylinder through it") from None
     turn = np.rad2deg(np.arccos(min(1.0, abs(float(fit.shape.axis @ tube.axis)))))
-    arc = arc_deg(points, fit.shape)
+    arc = _arc_deg(points, fit.shape)
     most_turn_deg = 20.0  # between both axes
     most_rms_mm = 0.3  # of the points about the cylinder: light is ten times as exact
     least_arc_deg = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
@@ -89,7 +89,7 @@ def before(points: Array, tube: Cylinder, ends: Array) -> Array:
     return points[facing & (along > first) & (along < last)]
 
 
-def arc_deg(points: Array, shape: Cylinder) -> float:
+def _arc_deg(points: Array, shape: Cylinder) -> float:
     """Angle, deg, that points : (n, 3) mm span about a cylinder's axis, less their outer hundredths."""
     middle = points.mean(axis=0) - shape.point
     up = middle - (middle @ shape.axis) * shape.axis

@@ -84,7 +84,7 @@ def find(image: NDArray, scale: Array, appearance: Appearance | None = None) -> 
     if level.ndim != 2 or min(level.shape) < 32:
         return _none(f"expected a grey image of at least 32x32 px, found shape {level.shape}")
     grey = 255 / look.dynamic_range_db  # levels a dB
-    first = first_echoes(level, int(np.ceil(look.top_mm / scale[1])), look.min_contrast_db * grey) * scale
+    first = _first_echoes(level, int(np.ceil(look.top_mm / scale[1])), look.min_contrast_db * grey) * scale
     if len(first) < 10:
         return _none("no echo stands out")
     circle, near = _rough_circle(first, look.diameter_mm)
@@ -154,7 +154,7 @@ def in_world(pixels: Array, world_from_pixel: Array) -> Array:
     return rigid.apply(world_from_pixel, np.column_stack([pixels, np.zeros(len(pixels))]))
 
 
-def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array:
+def _first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array:
     """The first echo of each column that has one : (n, 2) px u, v, to half a pixel.
 
     `contrast` is in grey levels, above the column's background; rows above `top` are left out.

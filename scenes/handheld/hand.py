@@ -187,10 +187,10 @@ def skin(hand: Skeleton, arm_mm: float, voxel: float = VOXEL_MM) -> trimesh.Trim
         hand_mesh = trimesh.Trimesh(hand_mesh.vertices, faces[:, ::-1], process=False)
     if arm_mm <= STUMP_MM:
         return hand_mesh
-    return lofts.joined([hand_mesh, cuff(hand, STUMP_MM - 25, arm_mm, 0.3)])
+    return lofts.joined([hand_mesh, _cuff(hand, STUMP_MM - 25, arm_mm, 0.3)])
 
 
-def cuff(hand: Skeleton, start_mm: float, end_mm: float, thick_mm: float) -> trimesh.Trimesh:
+def _cuff(hand: Skeleton, start_mm: float, end_mm: float, thick_mm: float) -> trimesh.Trimesh:
     """A closed tube about the forearm from `start_mm` to `end_mm` beyond the wrist: bare arm, sleeve, glove or watch strap."""
     edge = min(0.3 * (end_mm - start_mm), max(thick_mm, 0.4))
     middle = np.linspace(start_mm + edge, end_mm - edge, max(4, int((end_mm - start_mm) / 12)))
@@ -218,11 +218,11 @@ def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
     if kind == "sleeve":
         start = rng.uniform(5, 110)
         bare = start + 40
-        cloth = cuff(skeleton, start, rng.uniform(280, 380), rng.uniform(3, 9))
+        cloth = _cuff(skeleton, start, rng.uniform(280, 380), rng.uniform(3, 9))
     elif kind == "watch":
         start, bare = rng.uniform(8, 22), rng.uniform(280, 380)
         wide = rng.uniform(16, 30)
-        strap = cuff(skeleton, start, start + wide, rng.uniform(1.2, 2.5))
+        strap = _cuff(skeleton, start, start + wide, rng.uniform(1.2, 2.5))
         side = np.cross(skeleton.forearm, skeleton.broad) * rng.choice([-1, 1])
         spot = skeleton.wrist + (start + wide / 2) * skeleton.forearm + 21 * skeleton.size * side
         face = lofts.prism(lofts.superellipse((18, 18), rng.choice([2, 5]), 32), 9, 1)
@@ -230,7 +230,7 @@ def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
         cloth = lofts.joined([strap, face])
     elif kind == "glove":
         start, bare = rng.uniform(0, 15), rng.uniform(280, 380)
-        cloth = cuff(skeleton, start, start + rng.uniform(40, 90), rng.uniform(1.5, 4))
+        cloth = _cuff(skeleton, start, start + rng.uniform(40, 90), rng.uniform(1.5, 4))
     else:
         return [Part("skin", skin(skeleton, rng.uniform(280, 380)), True)]
     return [Part("skin", skin(skeleton, bare), True), Part("sleeve", cloth, True)]

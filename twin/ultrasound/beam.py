@@ -49,7 +49,7 @@ class Beam(NamedTuple):
     elevation_energy: Array  # (h,)
 
 
-def diffracted(
+def _diffracted(
     offsets: Array, depth: float, aperture: float, focus: float, wavelength: float, apodised: bool
 ) -> NDArray[np.complex128]:
     """Field H : (n,) of an aperture at offsets : (n,) mm from its axis, at a depth; `apodised` by a Hann window."""
@@ -84,7 +84,7 @@ def beam(transducer: Transducer) -> Beam:
     )
 
 
-def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
+def _receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
     """Width of the dynamic receive aperture, mm, at a depth."""
     return np.clip(np.asarray(depth) / transducer.receive_f_number, NEAREST_MM / 2, transducer.aperture_mm)
 
@@ -97,9 +97,9 @@ def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128
     table = np.empty((len(rows), taps + 1), complex)
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
         offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
-        receive = float(receive_aperture(transducer, depth))
-        sent = diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
-        table[k] = sent * diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
+        receive = float(_receive_aperture(transducer, depth))
+        sent = _diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
+        table[k] = sent * _diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
     faint = 2e-3  # of the peak: the point spread ends there (-54 dB)
     seen = np.abs(table) >= faint * np.abs(table).max(axis=1, keepdims=True)

@@ -19,7 +19,7 @@ from recon.model.calibration import WORLD, Calibration
 ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
 
 
-class Rectified(NamedTuple):
+class _Rectified(NamedTuple):
     """A camera of ROS's: its rectification, too."""
 
     stored: Stored
@@ -29,12 +29,12 @@ class Rectified(NamedTuple):
 
 def recognises(content: Content) -> bool:
     """Whether a file of the folder, or the file itself, has a camera's matrix."""
-    return bool(content.of_cameras(is_camera_info))
+    return bool(content.of_cameras(_is_camera_info))
 
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """A camera, or a pair of them by their rectification."""
-    texts = content.of_cameras(is_camera_info)
+    texts = content.of_cameras(_is_camera_info)
     if not content.path.is_dir():
         (text,) = texts.values()
         return camera_dialects.of_metres(content.path, {WORLD: _ros(content.path, text).stored})
@@ -46,7 +46,7 @@ def taken(optics: Calibration) -> Sequence[str]:
     return pair(optics)
 
 
-def is_camera_info(text: str) -> bool:
+def _is_camera_info(text: str) -> bool:
     """Whether a text has a camera's matrix, and is no camchain."""
     return re.search(r"^camera_matrix\s*:", text, re.MULTILINE) is not None and not kalibr.is_camchain(text)
 
@@ -130,7 +130,7 @@ def _pair(folder: Path, texts: Mapping[Path, str]) -> dict[str, Stored]:
     return camera_dialects.in_world(found)
 
 
-def _ros(path: Path, text: str) -> Rectified:
+def _ros(path: Path, text: str) -> _Rectified:
     content = yaml_text.loaded(path, text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a camera's fields, found {brief(content)}")
@@ -151,7 +151,7 @@ def _ros(path: Path, text: str) -> Rectified:
     projection = np.column_stack([matrix, np.zeros(3)])
     if "projection_matrix" in content:
         projection = _entries(path, content, "projection_matrix", (3, 4))
-    return Rectified(Stored(size, matrix, k, np.eye(4)), rotation, projection)
+    return _Rectified(Stored(size, matrix, k, np.eye(4)), rotation, projection)
 
 
 def _entries(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int, ...] | None = None) -> Array:
