@@ -28,7 +28,6 @@ PAPERS: dict[str, Size] = {  # upright, the smallest first
     "a0": (841.0, 1189.0),
 }
 RULER_MM = 100.0
-RULER_TEXT = "print at 100 %; this must be 100.0 mm"
 LEFT_MM = 10.0  # beside the card, for the upright ruler
 BELOW_MM = 17.0  # below the card, for the other ruler and the small print beside it
 FONT, BOLD, FONT_MM = "Helvetica", "Helvetica-Bold", 2.2  # 6.2 points
@@ -165,7 +164,8 @@ def _draw_ruler(canvas: Canvas, way: int) -> None:
     for mm in range(0, int(RULER_MM) + 1, 10):
         canvas.drawCentredString(mm, start + way * 3.6 - beyond, str(mm))
     canvas.setFont(BOLD, FONT_MM)
-    canvas.drawCentredString(RULER_MM / 2, start + way * 6.2 - beyond, RULER_TEXT)
+    ruler_text = "print at 100 %; this must be 100.0 mm"
+    canvas.drawCentredString(RULER_MM / 2, start + way * 6.2 - beyond, ruler_text)
 
 
 def _write_lines(canvas: Canvas, lines: Sequence[str], at: Size, width: float) -> None:

@@ -36,7 +36,6 @@ from recon.model.lengths import UNIT_KEY
 log = logging.getLogger(__name__)
 
 MM = 1000.0  # in a m
-OF_FILES = (".cameramodel", ".yaml", ".yml")  # of one camera each
 DEVICES = {
     "cam1": "cam1",
     "left": "cam1",
@@ -69,7 +68,8 @@ class Content:
 
     def of_cameras(self, tells: Callable[[str], bool]) -> dict[Path, str]:
         """Texts of one camera each: of the file, or of a folder's, those of which a dialect tells that they are its own."""
-        return {file: text for file, text in self.texts(*OF_FILES).items() if tells(text)}
+        of_files = (".cameramodel", ".yaml", ".yml")  # of one camera each
+        return {file: text for file, text in self.texts(*of_files).items() if tells(text)}
 
     @property
     def is_matlab(self) -> bool:

@@ -25,7 +25,6 @@ SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 KINDS = f"an image ({', '.join(SUFFIXES)})"
 MOST_PX = 1 << 26  # of an image
 PNG_BEGIN = b"\x89PNG\r\n\x1a\n"
-PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # numbers a pixel, by the kind of colour
 JPEG_BEGIN, NEXT_IMAGE, JPEG_END = b"\xff\xd8\xff", b"\xd8", b"\xd9"
 JPEG_MARKER = re.compile(rb"\xff+([\x02-\xcf\xd8-\xfe])")  # neither a number of the pixels' nor a mark between these
@@ -34,7 +33,6 @@ READERS = {  # by the beginnings of files
     JPEG_BEGIN: JpegImagePlugin.JpegImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
 }
-TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # the last two of BigTIFF, with places of 64 bits
 TIFF_NUMBERS = {3: "H", 4: "L", 16: "Q"}  # by the type of a field
 MODES = {"1": "L", "LA": "L"}  # of Pillow's, that become grey; all others become colours
 DAMAGE = (  # what Pillow raises on files damaged at random
@@ -95,7 +93,8 @@ def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
     """
     start = stream.read(len(PNG_BEGIN))
     stream.seek(0)
-    width, height = _size_of_tiff(path, stream) if start.startswith(TIFF_BEGINNINGS) else _opened(path, stream).size
+    tiff_beginnings = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # the last two of BigTIFF, with places of 64 bits
+    width, height = _size_of_tiff(path, stream) if start.startswith(tiff_beginnings) else _opened(path, stream).size
     if not 0 < width * height <= MOST_PX:
         raise InputError(f"{path}: expected an image of up to {MOST_PX} px, found {width}x{height}")
     return width, height
@@ -123,6 +122,7 @@ def _without_remarks(path: Path, data: bytes) -> bytes:
     Others may be odd, or unpack to any size. Source: W3C, Portable Network Graphics, third edition.
     """
     kept, position, kind = [PNG_BEGIN], len(PNG_BEGIN), b""
+    png_chunks = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data.ljust(position + 8, b"\0"), position)
         end = position + 12 + length
@@ -130,7 +130,7 @@ def _without_remarks(path: Path, data: bytes) -> bytes:
             raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
         if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             raise InputError(f"{path}: expected a whole PNG image, found damaged data at byte {position}")
-        if kind in PNG_CHUNKS:
+        if kind in png_chunks:
             kept.append(data[position:end])
         position = end
     return b"".join(kept)

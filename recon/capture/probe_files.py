@@ -40,7 +40,6 @@ SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
 AS_NPZ = f"give it as {AUTHORS} with sx, sy, T_I_T and"  # a plain matrix, for what there is no place in it
-PLUS_ENDS = ("Image", "Probe")
 SEPARATORS = bytes.maketrans(b",;[]()", b"      ")
 
 
@@ -65,13 +64,14 @@ def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
 def _plain_matrix(path: Path) -> tuple[str, Array] | None:
     """A matrix (4, 4) with its name, of a text of 16 numbers or a configuration of PLUS; None of any other file."""
     text = read_bytes(path, opencv_storage.MOST_BYTES, "a probe's calibration").lstrip()
+    plus_ends = ("Image", "Probe")
     if text.startswith(b"<") and b"opencv_storage" not in text:
-        found = [each for each in xml_text.read(path).iter("Transform") if (each.get("From"), each.get("To")) == PLUS_ENDS]
+        found = [each for each in xml_text.read(path).iter("Transform") if (each.get("From"), each.get("To")) == plus_ends]
         if len(found) != 1:
             raise InputError(
-                f"{path}: expected one Transform from {' to '.join(PLUS_ENDS)}, the probe's calibration, found {len(found)}"
+                f"{path}: expected one Transform from {' to '.join(plus_ends)}, the probe's calibration, found {len(found)}"
             )
-        text, name = (found[0].get("Matrix") or "").encode(), "To".join(PLUS_ENDS)
+        text, name = (found[0].get("Matrix") or "").encode(), "To".join(plus_ends)
     else:
         name = "matrix"
     words = text.translate(SEPARATORS).split()

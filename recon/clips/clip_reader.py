@@ -7,8 +7,6 @@ from recon.clips import dicom_clip, video_clip
 from recon.clips.clip import Clip
 from recon.errors import InputError
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm")
-
 
 def read(path: Path) -> Clip:
     """Open a clip: a folder of images in natural order, a video by the ending of its name, else a DICOM file.
@@ -20,7 +18,8 @@ def read(path: Path) -> Clip:
     """
     if path.is_dir():
         return _of_images(path)
-    if path.suffix.lower() in VIDEOS:
+    videos = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm")
+    if path.suffix.lower() in videos:
         return video_clip.read(path)
     return dicom_clip.read(path)
 

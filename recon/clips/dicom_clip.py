@@ -32,7 +32,6 @@ Dataset = Any
 Result = TypeVar("Result")
 
 MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
-PREAMBLE, PREFIX = 128, b"DICM"
 META = 2  # group of the tags before the part that may be packed
 
 LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
@@ -144,8 +143,9 @@ def _plain(path: Path, stream: BinaryIO) -> BinaryIO:
 
     Source: DICOM PS3.5, A.5: raw deflate behind the tags of group 2.
     """
-    stream.seek(PREAMBLE)
-    if stream.read(len(PREFIX)) == PREFIX:
+    preamble, prefix = 128, b"DICM"
+    stream.seek(preamble)
+    if stream.read(len(prefix)) == prefix:
         meta = read_dataset(stream, is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != META)
         if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
             length = stream.tell()

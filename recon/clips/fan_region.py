@@ -13,7 +13,6 @@ from recon.model.fan import STEEPEST_DEG, Fan, Mask, box
 Array = NDArray[np.float64]
 
 EXPECTED = "expected a part between two sides and two arcs that changes from frame to frame"
-FIELD = "fan=[u,v,first,last,left,right]"
 STIRS_DN = 0.3  # standard deviation over time, of what is dark but no border
 WITHIN = 0.9  # share of the changing part in the fan
 
@@ -30,8 +29,9 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         If nothing of some size changes, or what does is no fan.
     """
     mean, deviation = image_region.over_time(frames)
-    part = image_region.changing(deviation, name, FIELD)
-    expected = f"{EXPECTED}; give {FIELD}, or clip=[{','.join(map(str, box(part)))}], a rectangle about it"
+    field = "fan=[u,v,first,last,left,right]"
+    part = image_region.changing(deviation, name, field)
+    expected = f"{EXPECTED}; give {field}, or clip=[{','.join(map(str, box(part)))}], a rectangle about it"
     rows = np.flatnonzero(part.any(axis=1))
     left, right = part[rows].argmax(axis=1), part.shape[1] - 1 - part[rows, ::-1].argmax(axis=1)
     sides = [_side(rows, left.astype(float)), _side(rows, -right.astype(float))]

@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-SEPARATORS = ",;\t"  # else blanks
 MOST_SECONDS = 9e9  # of a time stamp, that nanoseconds of 64 bits can hold
 MOST_OFF = 0.02  # of a rotation from the nearest exact one
 
@@ -157,10 +156,11 @@ def _rotation(path: Path, line: int, values: Array) -> Array:
 
 def _numbers(path: Path, names: Names, timed: bool) -> tuple[list[int], Array]:
     """Numbers of lines, and values : (n, k) of columns; NaN of empty cells, but none of the first column if it is the time."""
+    separators = ",;\t"  # else blanks
     try:
         text = read_bytes(path, MOST_TABLE).decode("utf-8-sig")
         first = text.partition("\n")[0]
-        separator = next((one for one in SEPARATORS if one in first), " ")
+        separator = next((one for one in separators if one in first), " ")
         parsed = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
         rows = [row for row in enumerate(parsed, start=1) if any(row[1]) or (len(row[1]) > 1 and not timed)]
     except (UnicodeDecodeError, csv.Error):

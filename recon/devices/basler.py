@@ -25,9 +25,7 @@ SLICE_MS = 100  # of waiting, after which an end or an unplugged cable is notice
 FORMATS = {8: "Mono8", 10: "Mono10", 12: "Mono12"}
 EDGES = {"rising": "RisingEdge", "falling": "FallingEdge"}
 NS_PER_S = 10**9
-UNPLUGGED = "unplugged; check cable and power, then open it again"
 EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
-CHUNKS = ("ExposureTime", "PayloadCRC16")  # sent along with images by cameras that can
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,8 @@ class BaslerCamera:
             return
         self._features.put(True, "ChunkModeActive")
         offered = self._features.choices("ChunkSelector")
-        for chunk in [name for name in CHUNKS if name in offered]:
+        chunks = ("ExposureTime", "PayloadCRC16")  # sent along with images by cameras that can
+        for chunk in [name for name in chunks if name in offered]:
             self._features.put(chunk, "ChunkSelector")
             self._features.put(True, "ChunkEnable")
         self._features.put(bool(offered), "ChunkModeActive")
@@ -260,6 +259,7 @@ class BaslerCamera:
         from pypylon import genicam, pylon
 
         number, failure = self._first_number - 1, "stopped taking frames"
+        unplugged = "unplugged; check cable and power, then open it again"
         try:
             while not self._ending.is_set() and not self._device.IsCameraDeviceRemoved():
                 result = self._device.RetrieveResult(SLICE_MS, pylon.TimeoutHandling_Return)
@@ -271,7 +271,7 @@ class BaslerCamera:
             failure = words(error)
         finally:
             if not self._ending.is_set():
-                self._fail(UNPLUGGED if self._device.IsCameraDeviceRemoved() else failure)
+                self._fail(unplugged if self._device.IsCameraDeviceRemoved() else failure)
 
     def _keep(self, result: Any, number: int) -> None:
         """Take a result into the queue, or say why its frame is lost."""

@@ -21,8 +21,6 @@ from recon.files.regular import opened, read_bytes
 
 Buffer = bytes | memoryview
 
-BEGIN = b"MATLAB "  # of the header's text, in all versions from 5 on
-HDF5 = b"MATLAB 7.3"  # a file of another kind
 TAG = 8  # bytes, of an element's type and size
 ORDERS = {b"IM": "<", b"MI": ">"}
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by type of an element
@@ -35,8 +33,9 @@ HEAD = 1 << 12  # bytes within which an array's flags, shape and name stand
 
 def is_matlab(path: Path) -> bool:
     """Whether a file is one of MATLAB's, by its first bytes; raises InputError if it can't be read."""
+    begin = b"MATLAB "  # of the header's text, in all versions from 5 on
     with opened(path) as stream:
-        return stream.read(len(BEGIN)) == BEGIN
+        return stream.read(len(begin)) == begin
 
 
 def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) -> dict[str, NDArray]:
@@ -53,7 +52,8 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
         form.
     """
     data = read_bytes(path)
-    if data.startswith(HDF5):
+    hdf5 = b"MATLAB 7.3"  # a file of another kind
+    if data.startswith(hdf5):
         raise InputError(f"{path}: expected a MATLAB file of version 5 to 7, found 7.3: save it with -v7")
     arrays, objects = {}, False
     header = 128  # bytes, the order of bytes in the last two

@@ -39,7 +39,6 @@ NRRD_TYPES = {  # those of sequences, each with many names
     "double": "f8",
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
-UNCOMPRESSED, GREY = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
 
 
 @dataclass(frozen=True)
@@ -260,10 +259,11 @@ def _matroska(path: Path) -> ImageFile:
         raise fault(path, "tracks", "one of images", len(videos))
     track, frames = file.tracks[videos[0]], tuple(file.frames[videos[0]])
     width, height = track.number(matroska.WIDTH), track.number(matroska.HEIGHT)
-    coded = track.text(matroska.CODEC) != UNCOMPRESSED
+    uncompressed, grey = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
+    coded = track.text(matroska.CODEC) != uncompressed
     if coded:
         frames = tuple(sorted(frames))  # as they are shown, which may not be the order in which they are decoded
-    channels = 1 if track.text(matroska.COLOUR) == GREY and not coded else 3
+    channels = 1 if track.text(matroska.COLOUR) == grey and not coded else 3
     wrong = [frame.length for frame in frames if frame.length != width * height * channels]
     most_px = 1 << 26  # of a video's images
     if not 0 < width * height <= most_px or (wrong and not coded):

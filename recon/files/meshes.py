@@ -16,7 +16,6 @@ from recon.files.regular import read_bytes
 
 # glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
-PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # of a vertex, for which meshes have their own places
 DAMAGE = (  # what trimesh raises on files damaged at random
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
     *(NotImplementedError, AssertionError, ZeroDivisionError, NameError, struct.error),
@@ -66,7 +65,9 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
         raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
     stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(stored, "dtype", None), "names", None) or ()
-    for name in (name for name in names if name not in PLACED):
+    # of a vertex, for which meshes have their own places
+    placed = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")
+    for name in (name for name in names if name not in placed):
         mesh.vertex_attributes[name] = np.asarray(stored[name], float).ravel()
     return mesh
 

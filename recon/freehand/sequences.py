@@ -60,7 +60,6 @@ FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
 RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
 SHOWN = "Physical"  # where 3D Slicer shows the images, its RAS
-TRACK_NAME = "TrackName"  # field of the file that names the frame of the images shown there
 
 
 class FrameNames(NamedTuple):
@@ -118,7 +117,8 @@ def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibra
         f"ImageTo{SHOWN}": np.where(found[:, None, None], shown, np.eye(4)),
     }
     valid = dict.fromkeys([*transforms, "Image"], always) | {"ProbeToTracker": found, f"ImageTo{SHOWN}": found}
-    frames = Frames(times, transforms, valid, images, fields={TRACK_NAME: "Image"})
+    track_name = "TrackName"  # field of the file that names the frame of the images shown there
+    frames = Frames(times, transforms, valid, images, fields={track_name: "Image"})
     _check(Path("sequence"), frames)
     return frames
 

@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 TRIALS = 2000  # triples of them; a plane of 0.15 of the points is missed with a chance of 0.001
-NEAR_MM = 1.0  # of the plane: a point on it
 STANDS_MM = 2.0  # before the plane: not the plane any more
 
 
@@ -64,9 +63,10 @@ def _standing_plane(points: Array, seed: int = 0) -> Plane | None:
     offsets = (normals * a[length > 0]).sum(axis=1)
     if not len(normals):
         return None
-    on = [np.count_nonzero(np.abs(some @ normal - offset) < NEAR_MM) for normal, offset in zip(normals, offsets, strict=True)]
+    near_mm = 1.0  # of the plane: a point on it
+    on = [np.count_nonzero(np.abs(some @ normal - offset) < near_mm) for normal, offset in zip(normals, offsets, strict=True)]
     best = int(np.argmax(on))
-    near = some[np.abs(some @ normals[best] - offsets[best]) < NEAR_MM]
+    near = some[np.abs(some @ normals[best] - offsets[best]) < near_mm]
     least_on = 0.15  # of the points, on a plane that things stand on
     if len(near) < max(4, least_on * len(some)):
         return None

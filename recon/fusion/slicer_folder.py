@@ -21,9 +21,6 @@ from recon.fusion.scene_page import UNKNOWN, row_of
 from recon.geometry import rigid
 from recon.segmentation.mass_files import FoundMass
 
-SCHEMA = (
-    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
-)
 MARKUPS, TRANSFORM, SCRIPT, README = "masses.mrk.json", "target_to_world.tfm", "show.py", "README.txt"
 TEMPLATES = Path(__file__).parent
 
@@ -104,4 +101,5 @@ def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
         place = np.asarray(mass.mesh.center_mass).tolist()
         points.append({"id": str(number), "label": name, "description": told, "position": place, "positionStatus": "defined"})
     one = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
-    return {"@schema": SCHEMA, "markups": [one]}
+    schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
+    return {"@schema": schema, "markups": [one]}

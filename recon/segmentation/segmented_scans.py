@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 OVERLAYS = 4
 COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm")  # figures
-NONE_FOUND = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,8 @@ def find_masses(
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
-    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
+    none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
+    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
     lines += [f"blur        {blur}"] if blur is not None and found else []
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):

@@ -13,8 +13,6 @@ from recon.skin_projection import skin_curve
 from recon.skin_projection.projector_image import Lines
 from recon.skin_projection.skin_curve import SkinCurve
 
-SCHEMA = "sonotwin-curves/1"
-
 
 def write_json(path: Path, curves: Sequence[SkinCurve]) -> None:
     """Write points of curves in mm of the world, a list for each piece that lies on the skin; whole or not at all."""
@@ -23,7 +21,8 @@ def write_json(path: Path, curves: Sequence[SkinCurve]) -> None:
         {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, digits).tolist() for piece in pieces(curve.points)]}
         for curve in curves
     ]
-    content = {"schema": SCHEMA, "unit": "mm", "frame": "camera 1", "curves": listed}
+    schema = "sonotwin-curves/1"
+    content = {"schema": schema, "unit": "mm", "frame": "camera 1", "curves": listed}
     with atomic.new_file(path) as temporary:
         temporary.write_text(json.dumps(content) + "\n", encoding="utf-8")
 

@@ -29,9 +29,7 @@ PORT = 18944  # registered for OpenIGTLink
 MOST_CLIENTS = 16
 MOST_NAMES = 256  # pairs of kind and device, of each of which a message is held
 STALLED_S = 30.0  # for one message, after which a client that takes nothing is dropped
-PIECE = 1 << 16  # bytes that are read at once
 LOOK_S = 0.5  # between two looks at whether to end
-QUERIES = ("GET_", "STT_", "STP_")
 
 Key = tuple[str, str]  # kind and device
 Answer = Callable[[Message], Mapping[Key, bytes]]
@@ -206,8 +204,9 @@ class _Client:
 
     def _read(self, splitter: Splitter, pace: Pace) -> None:
         """Read once and answer what is asked."""
+        piece = 1 << 16  # bytes that are read at once
         try:
-            data = self._connection.recv(PIECE)
+            data = self._connection.recv(piece)
         except TimeoutError:  # a client need not say anything
             return
         if not data:
@@ -225,7 +224,8 @@ class _Client:
 
 def _is_query(header: Header) -> bool:
     most_query_bytes = 1 << 16
-    return header.kind.startswith(QUERIES) and header.size <= most_query_bytes
+    queries = ("GET_", "STT_", "STP_")
+    return header.kind.startswith(queries) and header.size <= most_query_bytes
 
 
 def _listener(host: str, port: int) -> socket.socket:
