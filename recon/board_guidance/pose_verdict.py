@@ -6,17 +6,20 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.board_guidance.board_blur import blur
 from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Reach, apart, candidates, reach_of
 from recon.board_guidance.next_pose import CANDIDATES, few, knowledge
 from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sighting
 from recon.geometry.camera import Array
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Sighting
+
+STEEPEST = 0.998  # quantile of the slopes: discs of 20 px radius have 1 % of all pixels on edges of one direction
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ def _camera_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
     blurred_px = 3.0  # standard deviation, in the softest direction
     smeared = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
     for device, image in observation.lit.items():
-        found = blur(image, sighting.pixels[device])
+        found = board_blur(image, sighting.pixels[device])
         if found.most > smeared[0] * found.least + smeared[1]:
             yield f"{device}: smeared by {found.most:.1f} px: the board moved during the exposure; rest it, or expose shorter"
         elif found.most > blurred_px:
@@ -149,3 +152,34 @@ def _disagreement(so_far: SoFar, extended: SoFar) -> str | None:
         return None
     device = list(so_far.sizes)[int(np.argmax(times))]
     return f"{device}: contradicts the other poses by {times.max():.0f} times the noise: the board moved between frames; rest it"
+
+
+class Blur(NamedTuple):
+    """Standard deviations of the blur, px."""
+
+    least: float  # in the sharpest direction
+    most: float  # in the softest
+
+
+def board_blur(image: NDArray, pixels: Array) -> Blur:
+    """Blur of the image : (h, w) of a board whose points lie at pixels : (n, 2), NaN where not seen.
+
+    An edge of contrast C that is blurred by s has the steepest slope `C / (sqrt(2 pi) s)` across it.
+    """
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    around = 0.1  # of the points' extent, beyond them
+    beyond = around * np.ptp(seen, axis=0)
+    left, top = np.maximum(seen.min(axis=0) - beyond, 0).astype(int)
+    right, low = (seen.max(axis=0) + beyond + 2).astype(int)
+    smoothing = 1.0  # px, standard deviation: taken out of the blur again
+    level = cv2.GaussianBlur(np.float32(image[top:low, left:right]), (0, 0), smoothing)
+    across, down = (cv2.Sobel(level, cv2.CV_32F, du, dv, ksize=1, scale=0.5) for du, dv in ((1, 0), (0, 1)))
+    dark, bright = 0.05, 0.95  # quantiles of the levels, both of which a board has many of
+    contrast = float(np.subtract(*np.quantile(level, [bright, dark])))
+    widths = []
+    directions = 4  # over half a turn
+    for way in np.pi / directions * np.arange(directions):
+        steepest = float(np.quantile(np.abs(np.cos(way) * across + np.sin(way) * down), STEEPEST))
+        width = contrast / (np.sqrt(2 * np.pi) * max(steepest, 1e-9))
+        widths.append(np.sqrt(max(width**2 - smoothing**2, 0.0)))
+    return Blur(min(widths), max(widths))

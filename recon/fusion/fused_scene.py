@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.files import meshes
-from recon.files.layers import painted, pictured
+from recon.files.meshes import painted, pictured
 from recon.freehand.scans import Scans
 from recon.fusion import probe_shape
 from recon.geometry import rigid

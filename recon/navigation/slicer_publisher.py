@@ -15,6 +15,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.devices.openigtlink.igtl_header import MOST_NAME_BYTES
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Text, Transform
+from recon.devices.openigtlink.igtl_model import Model
+from recon.devices.openigtlink.igtl_server import Server
 from recon.errors import short
 from recon.freehand.sequences import RAS_FROM_LPS
 from recon.geometry import rigid
@@ -22,9 +26,7 @@ from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
 
 log = logging.getLogger(__name__)
-
 Array = NDArray[np.float64]
-
 TARGET, PROBE = "TargetToRAS", "ProbeToRAS"
 SCAN, STATUS, SKIN, DISTANCES = "BScan", "Status", "Skin", "Distances"
 PROBE_BODY = "Probe"  # a model in the target's frame, to be put under its transform
@@ -118,3 +120,30 @@ def _shortened(name: str, end: str = "") -> str:
 def _distances_line(moment: Moment) -> str:
     """Distances of the B-scan's plane from the masses, as one line."""
     return "; ".join(f"{each.name} {each.distance_mm:.1f} mm{', cut' * each.cut}" for each in moment.distances)
+
+
+class IgtlSender:
+    """A `recon.navigation.slicer_publisher.Sender` that publishes by a server, and closes it in the end."""
+
+    def __init__(self, server: Server) -> None:
+        self._server = server
+
+    def transform(self, name: str, ras_from_frame: Array, time_ns: int) -> None:
+        """Send a transform : (4, 4) mm."""
+        self._server.publish(Message(name, Transform(ras_from_frame), time_ns))
+
+    def image(self, name: str, levels: NDArray[np.uint8], ras_from_index: Array, time_ns: int) -> None:
+        """Send an image : (h, w) in its place."""
+        self._server.publish(Message(name, Image(levels, ras_from_index), time_ns))
+
+    def model(self, name: str, points: Array, triangles: NDArray[np.int64]) -> None:
+        """Send a surface."""
+        self._server.publish(Message(name, Model(points, triangles)))
+
+    def text(self, name: str, text: str, time_ns: int) -> None:
+        """Send a line of text."""
+        self._server.publish(Message(name, Text(text), time_ns))
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._server.close()

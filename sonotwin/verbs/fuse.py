@@ -21,7 +21,7 @@ from rich.console import Console
 from recon.capture import calibration_files, sweep_part
 from recon.capture.images import read_grey
 from recon.errors import Implausible, InputError
-from recon.files import atomic, layers, metrics
+from recon.files import atomic, meshes, metrics
 from recon.files.volumes import read_volume
 from recon.freehand import scans as freehand_scans
 from recon.fusion import fused_scene, scene_page, skin, slicer_folder
@@ -97,7 +97,7 @@ def run(config: Config) -> None:
         scene = read(config)
         made = fused_scene.layers(scene, config.scans)
     with console.status("writing"), atomic.new_folder(config.out, "fuse") as folder:
-        layers.write_layers(folder / SCENE, made)
+        meshes.write_layers(folder / SCENE, made)
         scene_page.write(folder / PAGE, scene, config.capture.resolve().name)
         slicer_folder.write(folder / SLICER, scene, voxels, config.scans)
         counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made), "masses": len(scene.masses)}
