@@ -24,7 +24,7 @@ from recon.devices.basler import BaslerSettings, open_camera
 from recon.devices.camera_pairs import CameraPair, Pair
 from recon.devices.interfaces import Image
 from twin.accuracy.table_rows import Measurement, Row
-from twin.devices.virtual_operator import OneTake
+from twin.devices.virtual_session import OneTake
 
 PAIRS = 1000
 SIZE = (1280, 1024)

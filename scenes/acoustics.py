@@ -55,7 +55,6 @@ TISSUES = {
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
 }
 
-SOFT = ("gel", "silicone", "tumour", "gelatin", "cyst", "bright", "dark")  # of which the speed is that of tissue
 KINDS = "scenes.kinds"  # of scenes, a module each
 WATER_C = 22.0  # of the water above
 
@@ -72,9 +71,10 @@ def surroundings(scene: Scene) -> Tissue:
 
 def faster(tissue: Tissue, ratio: float, warmer_c: float) -> Tissue:
     """The same medium, soft, at a ratio of its speed, or water at another temperature; densities stay."""
+    soft = ("gel", "silicone", "tumour", "gelatin", "cyst", "bright", "dark")  # of which the speed is that of tissue
     if tissue == TISSUES["water"]:
         ratio = float(speed_of_sound(WATER_C + warmer_c) / speed_of_sound(WATER_C))
-    elif tissue not in [TISSUES[name] for name in SOFT]:
+    elif tissue not in [TISSUES[name] for name in soft]:
         return tissue
     return replace(tissue, speed=tissue.speed * ratio, impedance=tissue.impedance * ratio)
 

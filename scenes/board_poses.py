@@ -23,13 +23,10 @@ from scenes.noise import Seed
 
 Array = rigid.Array
 
-RIM_POINTS = 16  # corners of the polygon around each circle
 TRIES = 200  # of orientations for one pose
 GRID = 24  # places across and down the view where room is looked for
 STEPS = 12  # of the bisection to the border of the room: a 2000th of the way
-OUTWARDS = 0.3  # power that draws poses from the middle to the corners of the room
 DEPTHS_MM = (606.0, 713.0)  # the working range of the rig of Meza et al. 2021
-ASKEW = 2.0  # power that draws turns to the quarters: half of them lie within 11 deg
 
 
 class Config(Part):
@@ -75,7 +72,8 @@ def orientation(tilt_deg: float, draw: Array) -> Array:
     evenly over the cap of directions up to `tilt_deg` away, so that large tilts, which tell most, are common.
     """
     quarter, beside = np.divmod(4 * draw[0], 1)
-    turn = np.pi / 2 * (quarter + 0.5 * _drawn(2 * beside - 1, ASKEW))
+    askew = 2.0  # power that draws turns to the quarters: half of them lie within 11 deg
+    turn = np.pi / 2 * (quarter + 0.5 * _drawn(2 * beside - 1, askew))
     tilt, way = np.deg2rad(tilt_deg) * np.sqrt(draw[1]), 2 * np.pi * draw[2]
     tilted = Rotation.from_rotvec(tilt * np.array([np.cos(way), np.sin(way), 0]))
     return (tilted * Rotation.from_rotvec([0, 0, turn])).as_matrix()
@@ -83,9 +81,10 @@ def orientation(tilt_deg: float, draw: Array) -> Array:
 
 def outline(design: AsymmetricCircles) -> Array:
     """A convex outline around all circles : (n, 3) mm in the board's frame."""
-    turn = 2 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    circle = design.diameter_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(RIM_POINTS)])
-    rims = (design.points()[:, None] + circle / np.cos(np.pi / RIM_POINTS)).reshape(-1, 3)
+    rim_points = 16  # corners of the polygon around each circle
+    turn = 2 * np.pi * np.arange(rim_points) / rim_points
+    circle = design.diameter_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn), np.zeros(rim_points)])
+    rims = (design.points()[:, None] + circle / np.cos(np.pi / rim_points)).reshape(-1, 3)
     return rims[ConvexHull(rims[:, :2]).vertices]
 
 
@@ -118,7 +117,8 @@ def _place(hull: Array, depth: float, draw: Array, margin: float, devices: Seque
     if len(room) == 0:
         return None
     middle = room[np.linalg.norm(room - room.mean(axis=0), axis=1).argmin()]
-    square = _drawn(2 * draw - 1, OUTWARDS)
+    outwards = 0.3  # power that draws poses from the middle to the corners of the room
+    square = _drawn(2 * draw - 1, outwards)
     away = max(np.abs(square).max(), 1e-9)
     border = np.append(np.abs(room - middle)[:, :2].max(axis=0) * square / away, 0)
     near, far = 0.0, 2.0

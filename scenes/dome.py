@@ -16,17 +16,6 @@ from scenes.noise import smooth_noise
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
-OUTLINE_POINTS = 4096
-FOOTPRINT_POWER = 2.25  # superellipse exponent: a little fuller than an ellipse
-FOOT = 0.05  # last part of rho, over which the skin turns in to the base
-FOOT_SLOPE = 0.45  # of the slope left at the very rim
-SUPPORT = 2e-4  # last step of rho, which keeps interpolated normals true up to the rim
-AREOLA_EDGE_MM = 3.5  # over which the areola passes into the skin
-BORDER_WOBBLE = 0.014  # relative standard deviation of each of the border's harmonics
-NIPPLE_CREASE = 0.06  # relative, of each of three harmonics around the nipple
-MONTGOMERY_HEIGHT_MM = (0.25, 0.55)
-MONTGOMERY_RADIUS_MM = (0.9, 1.3)  # standard deviation of a Gaussian bump
-
 
 @dataclass(frozen=True)
 class Form:
@@ -119,23 +108,28 @@ def _rings(form: Form, reach: float, height: float) -> Array:
     z = height * _profile(rho, form.steepness) + form.nipple_height * _nipple(rho * reach, form.nipple_width)
     length = np.concatenate([[0], np.cumsum(np.hypot(np.diff(rho) * reach, np.diff(z)))])
     steps = int(np.ceil(length[-1] / form.edge))
-    return np.append(np.interp(np.linspace(0, length[-1], steps + 1), length, rho)[:-1], [1 - SUPPORT, 1])
+    support = 2e-4  # last step of rho, which keeps interpolated normals true up to the rim
+    return np.append(np.interp(np.linspace(0, length[-1], steps + 1), length, rho)[:-1], [1 - support, 1])
 
 
 def _profile(rho: Array, steepness: float) -> Array:
     """Relative height over rho: an elliptic cap whose slope eases over the foot; 1 at the apex, 0 at the rim."""
     x = np.linspace(0, 1, 4001)
     slope = steepness**2 * x / np.sqrt(1 - (steepness * x) ** 2)
-    slope *= 1 - (1 - FOOT_SLOPE) * _smoothstep((x - (1 - FOOT)) / FOOT)
+    foot = 0.05  # last part of rho, over which the skin turns in to the base
+    foot_slope = 0.45  # of the slope left at the very rim
+    slope *= 1 - (1 - foot_slope) * _smoothstep((x - (1 - foot)) / foot)
     fall = cumulative_trapezoid(slope, x, initial=0)
     return np.interp(rho, x, 1 - fall / fall[-1])
 
 
 def _rim_distance(form: Form, theta: Array) -> Array:
     """Distance from the apex to the footprint's outline, seen from the apex in the directions theta."""
-    turn = 2 * np.pi * np.arange(OUTLINE_POINTS) / OUTLINE_POINTS
+    outline_points = 4096
+    turn = 2 * np.pi * np.arange(outline_points) / outline_points
     cos, sin = np.cos(turn), np.sin(turn)
-    radius = (np.abs(cos) ** FOOTPRINT_POWER + np.abs(sin) ** FOOTPRINT_POWER) ** (-1 / FOOTPRINT_POWER)
+    footprint_power = 2.25  # superellipse exponent: a little fuller than an ellipse
+    radius = (np.abs(cos) ** footprint_power + np.abs(sin) ** footprint_power) ** (-1 / footprint_power)
     x, y = radius * cos, radius * sin
     outline = np.column_stack([x * form.size[0] / 2, y * (1 + form.taper * x) * form.size[1] / 2]) - form.apex
     angle = np.arctan2(outline[:, 1], outline[:, 0])
@@ -153,20 +147,25 @@ def _areola(form: Form, offset: Array, rng: np.random.Generator) -> tuple[Array,
     distance, theta = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
     order = np.arange(2, 9)
     waves = np.cos(theta[:, None] * order + rng.uniform(0, 2 * np.pi, order.size))
-    border = form.areola_width / 2 * (1 + waves @ rng.normal(0, BORDER_WOBBLE, order.size))
-    areola = _smoothstep((border - distance) / AREOLA_EDGE_MM + 0.5)
+    border_wobble = 0.014  # relative standard deviation of each of the border's harmonics
+    border = form.areola_width / 2 * (1 + waves @ rng.normal(0, border_wobble, order.size))
+    areola_edge_mm = 3.5  # over which the areola passes into the skin
+    areola = _smoothstep((border - distance) / areola_edge_mm + 0.5)
     crease = np.cos(theta[:, None] * [2, 3, 5] + rng.uniform(0, 2 * np.pi, 3)).sum(axis=1)
-    uneven = 1 + NIPPLE_CREASE * crease * np.minimum(1, distance / form.nipple_width)  # none in the middle, where theta jumps
+    nipple_crease = 0.06  # relative, of each of three harmonics around the nipple
+    uneven = 1 + nipple_crease * crease * np.minimum(1, distance / form.nipple_width)  # none in the middle, where theta jumps
     nipple = _nipple(distance * uneven, form.nipple_width)
 
     bumps, raised = np.zeros(len(offset)), form.areola_height * areola + form.nipple_height * nipple
     sector = 2 * np.pi / max(form.montgomery_bumps, 1)
+    montgomery_height_mm = (0.25, 0.55)
+    montgomery_radius_mm = (0.9, 1.3)  # standard deviation of a Gaussian bump
     for k in range(form.montgomery_bumps):
         turn = sector * (k + rng.uniform(-0.35, 0.35))
         away = rng.uniform(0.5, 0.82) * form.areola_width / 2
         middle = away * np.array([np.cos(turn), np.sin(turn)])
-        bump = np.exp(-0.5 * (np.linalg.norm(offset - middle, axis=1) / rng.uniform(*MONTGOMERY_RADIUS_MM)) ** 2)
-        raised += rng.uniform(*MONTGOMERY_HEIGHT_MM) * bump
+        bump = np.exp(-0.5 * (np.linalg.norm(offset - middle, axis=1) / rng.uniform(*montgomery_radius_mm)) ** 2)
+        raised += rng.uniform(*montgomery_height_mm) * bump
         bumps = np.maximum(bumps, bump)
     return areola, nipple, bumps, raised
 

@@ -13,7 +13,6 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 TOLERANCE_MM = 0.001  # largest distance between a facet and the true curve; a thirtieth of the rig's noise
-SUPPORT_MM = 0.02  # width of the band beside a sharp rim, which keeps interpolated normals true up to the rim
 
 
 def moved(mesh: trimesh.Trimesh, to_from: Array) -> trimesh.Trimesh:
@@ -60,7 +59,8 @@ def plate(size: tuple[float, float], thickness: float) -> trimesh.Trimesh:
 def rod(radius: float, length: float) -> trimesh.Trimesh:
     """A circular cylinder along x, centred on the origin, within `TOLERANCE_MM` of the true one."""
     sections = int(np.ceil(np.pi / np.arccos(1 - min(TOLERANCE_MM / radius, 0.01))))
-    band, half = SUPPORT_MM, length / 2
+    support_mm = 0.02  # width of the band beside a sharp rim, which keeps interpolated normals true up to the rim
+    band, half = support_mm, length / 2
     outline = [(0, -half), (radius - band, -half), (radius, -half), (radius, band - half)]
     outline += [(r, -z) for r, z in reversed(outline)]
     mesh = trimesh.creation.revolve(outline, sections=sections)

@@ -6,13 +6,6 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-SUBDIVISIONS = 4  # of the icosphere: 2562 vertices, edges of 0.5 to 1.2 mm
-ASPECT = (1.0, 0.88, 0.78)  # of the body beneath the lobes; masses are seldom round
-LOBES = (7, 10)  # fewest and most
-LOBE_HEIGHT = (0.22, 0.42)  # of the body's radius
-LOBE_SHARPNESS = 12.0  # concentration of a lobe about its direction: half height at 20 deg
-LOBE_SCATTER = 0.25  # standard deviation of lobes from an even spread, rad
-
 
 def tumour(size_mm: float, rng: np.random.Generator) -> trimesh.Trimesh:
     """A lobulated mass about the origin, whose greatest extent in any direction is exactly `size_mm`.
@@ -20,19 +13,25 @@ def tumour(size_mm: float, rng: np.random.Generator) -> trimesh.Trimesh:
     Its radius is `1 + sum_k h_k exp(s (d . d_k - 1))` in direction d: bumps (von Mises-Fisher lobes) in directions d_k that are
     spread over the sphere, on a golden spiral with some scatter, so that hollows stay between them.
     """
-    sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
+    subdivisions = 4  # of the icosphere: 2562 vertices, edges of 0.5 to 1.2 mm
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     directions = sphere.vertices
-    count = rng.integers(LOBES[0], LOBES[1] + 1)
-    axes = golden_spiral(int(count)) + LOBE_SCATTER * rng.standard_normal((count, 3))
+    lobes = (7, 10)  # fewest and most
+    count = rng.integers(lobes[0], lobes[1] + 1)
+    lobe_scatter = 0.25  # standard deviation of lobes from an even spread, rad
+    axes = _golden_spiral(int(count)) + lobe_scatter * rng.standard_normal((count, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    heights = rng.uniform(*LOBE_HEIGHT, count)
-    radius = 1 + np.exp(LOBE_SHARPNESS * (directions @ axes.T - 1)) @ heights
-    vertices = Rotation.random(rng=rng).apply(radius[:, None] * directions * ASPECT)
+    lobe_height = (0.22, 0.42)  # of the body's radius
+    heights = rng.uniform(*lobe_height, count)
+    lobe_sharpness = 12.0  # concentration of a lobe about its direction: half height at 20 deg
+    radius = 1 + np.exp(lobe_sharpness * (directions @ axes.T - 1)) @ heights
+    aspect = (1.0, 0.88, 0.78)  # of the body beneath the lobes; masses are seldom round
+    vertices = Rotation.random(rng=rng).apply(radius[:, None] * directions * aspect)
     vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     return trimesh.Trimesh(vertices * (size_mm / caliper(vertices)), sphere.faces, process=False)
 
 
-def golden_spiral(count: int) -> np.ndarray:
+def _golden_spiral(count: int) -> np.ndarray:
     """Unit vectors : (count, 3) spread evenly over the sphere."""
     index = np.arange(count)
     z = 1 - (2 * index + 1) / count

@@ -24,8 +24,6 @@ from recon.model.rig import Rig
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Sighting, sight, with_projector
 
-PATIENCE = 2  # tries of an asked pose, after which another is asked for: it may be one that can't be held
-
 Images = Mapping[str, NDArray]  # camera: (h, w)
 
 
@@ -64,7 +62,8 @@ class BoardGuide:
     def insist(self) -> Step:
         """Ask for the same pose after a try that was refused, for another one after some."""
         self._tries += 1
-        return self.suggest() if self._asked is None or self._tries == PATIENCE else self._step(self._asked)
+        patience = 2  # tries of an asked pose, after which another is asked for: it may be one that can't be held
+        return self.suggest() if self._asked is None or self._tries == patience else self._step(self._asked)
 
     def over(self, camera: str, image: NDArray) -> Over | None:
         """The asked pose's outline over camera 1's image : (h, w), and the way there from where the board is seen."""

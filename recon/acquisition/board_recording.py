@@ -23,8 +23,6 @@ from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 
-HEADROOM = 0.75  # of the level, at the first pose: others come nearer, and turn to the projector
-
 
 @dataclass(frozen=True)
 class BoardPlan:
@@ -58,7 +56,8 @@ def record_board(recording: Recording, stage: Stage, operator: Operator, plan: B
     guide = new_guide(plan.rig, stage.cameras, stage.projector.size, plan.board, plan.patterns, plan.reach, rng)
     if recording.contents.board is not None:
         guide.read(read_board(recording.folder), say)
-    darker = plan.exposing.model_copy(update={"level": HEADROOM * plan.exposing.level})
+    headroom = 0.75  # of the level, at the first pose: others come nearer, and turn to the projector
+    darker = plan.exposing.model_copy(update={"level": headroom * plan.exposing.level})
     session = StillSession(stage, darker, plan.limits, say, show, frame_checks.light_faults, guide.over)
     names: list[str] = []
     operator.ask(guide.suggest())

@@ -11,12 +11,6 @@ from recon.acquisition.frame_checks import BRIGHTEST
 from recon.devices.interfaces import Camera
 from recon.model.rig import Part, Positive
 
-TRIES = 6
-FIRST_S = 0.01
-NEAR = 0.05  # relative, of the level that is wanted
-BLIND = 8.0  # times by which the exposure changes where an image is all black, or saturated
-ABOVE_BLACK = 0.02  # of full scale, that the brightest pixels must reach to say anything
-
 
 class Exposing(Part):
     """How long cameras expose."""
@@ -39,13 +33,18 @@ def set_exposure(camera: Camera, seen: Callable[[], NDArray], exposing: Exposing
     if exposing.exposure_s is not None:
         camera.set_exposure(exposing.exposure_s, exposing.gain)
         return exposing.exposure_s
-    seconds, full = min(FIRST_S, exposing.longest_s), 2**camera.bits - 1
-    for _ in range(TRIES):
+    first_s = 0.01
+    seconds, full = min(first_s, exposing.longest_s), 2**camera.bits - 1
+    above_black = 0.02  # of full scale, that the brightest pixels must reach to say anything
+    tries = 6
+    near = 0.05  # relative, of the level that is wanted
+    blind = 8.0  # times by which the exposure changes where an image is all black, or saturated
+    for _ in range(tries):
         camera.set_exposure(seconds, exposing.gain)
         found = float(np.percentile(seen()[::4, ::4], BRIGHTEST)) / full
-        if abs(found - exposing.level) <= NEAR * exposing.level or (found < exposing.level and seconds == exposing.longest_s):
+        if abs(found - exposing.level) <= near * exposing.level or (found < exposing.level and seconds == exposing.longest_s):
             break
-        times = 1 / BLIND if found >= 1 else BLIND if found < ABOVE_BLACK else exposing.level / found
+        times = 1 / blind if found >= 1 else blind if found < above_black else exposing.level / found
         seconds = min(max(round(seconds * times, 6), 1e-5), exposing.longest_s)
     camera.set_exposure(seconds, exposing.gain)
     return seconds

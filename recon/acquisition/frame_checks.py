@@ -15,12 +15,6 @@ Images = NDArray[np.uint8] | NDArray[np.uint16]
 Share = Annotated[float, Field(gt=0, le=1)]
 
 BRIGHTEST = 99.9  # percentile that counts as the brightest: a few highlights and hot pixels don't
-WINDOW_PX = 15  # about an edge: both of its levels must lie within
-LEAST_STEP = 0.2  # of the image's range, of an edge that is looked at
-DIRECTIONS = 4  # of edges, told apart: motion leaves those along it sharp
-FEW = 40  # pixels of edges in a direction, with fewer of which nothing is said
-SHARP = 30.0  # percentile of the edges' widths that counts: others lie on shades, and beside other edges
-STEP_BLUR_PX = 0.6  # standard deviation by which the gradient's own differences widen an edge, with the pixels
 
 
 class Limits(Part):
@@ -72,13 +66,13 @@ def look(image: Images, bits: int) -> Look:
     """Measure brightness and edges of a frame : (h, w)."""
     full = 2**bits - 1
     level = float(np.percentile(image[::4, ::4], BRIGHTEST)) / full
-    widths = edge_widths(image)
+    widths = _edge_widths(image)
     if not widths:
         return Look(level, float(np.mean(image >= full)), np.nan, np.nan)
     return Look(level, float(np.mean(image >= full)), min(widths), float(np.sqrt(max(widths) ** 2 - min(widths) ** 2)))
 
 
-def edge_widths(image: Images) -> list[float]:
+def _edge_widths(image: Images) -> list[float]:
     """Standard deviations of edges in px, one a direction that has enough of them.
 
     A step of height H that is blurred by sigma has the largest gradient `H / (sigma sqrt(2 pi))`.
@@ -86,16 +80,22 @@ def edge_widths(image: Images) -> list[float]:
     smooth = np.float32(image)
     across, down = (cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
     gradient = cv2.magnitude(across, down)
-    window = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
+    window_px = 15  # about an edge: both of its levels must lie within
+    window = np.ones((window_px, window_px), np.uint8)
     step = cv2.dilate(smooth, window) - cv2.erode(smooth, window)
     low, high = np.percentile(smooth[::4, ::4], (100 - BRIGHTEST, BRIGHTEST))
     crest = gradient >= cv2.dilate(gradient, np.ones((3, 3), np.uint8))
-    v, u = np.nonzero(crest & (step > max(LEAST_STEP * (high - low), 8.0)) & (gradient > 0.3 * step / WINDOW_PX))
+    least_step = 0.2  # of the image's range, of an edge that is looked at
+    v, u = np.nonzero(crest & (step > max(least_step * (high - low), 8.0)) & (gradient > 0.3 * step / window_px))
     width = step[v, u] / (np.sqrt(2 * np.pi) * gradient[v, u])
-    turn = np.arctan2(down[v, u], across[v, u]) * DIRECTIONS / np.pi
-    direction = np.rint(turn).astype(int) % DIRECTIONS
-    found = [np.percentile(width[direction == k], SHARP) for k in range(DIRECTIONS) if np.sum(direction == k) >= FEW]
-    return [float(np.sqrt(max(each**2 - STEP_BLUR_PX**2, 0.0))) for each in found]
+    directions = 4  # of edges, told apart: motion leaves those along it sharp
+    turn = np.arctan2(down[v, u], across[v, u]) * directions / np.pi
+    direction = np.rint(turn).astype(int) % directions
+    sharp = 30.0  # percentile of the edges' widths that counts: others lie on shades, and beside other edges
+    few = 40  # pixels of edges in a direction, with fewer of which nothing is said
+    found = [np.percentile(width[direction == k], sharp) for k in range(directions) if np.sum(direction == k) >= few]
+    step_blur_px = 0.6  # standard deviation by which the gradient's own differences widen an edge, with the pixels
+    return [float(np.sqrt(max(each**2 - step_blur_px**2, 0.0))) for each in found]
 
 
 def contrast(images: Images, patterns: Patterns, bits: int, limits: Limits) -> Contrast:

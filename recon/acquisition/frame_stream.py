@@ -11,9 +11,7 @@ from recon.acquisition.pictures import Say
 from recon.devices.interfaces import DeviceError, Frame
 
 WAITING = 128  # sets of frames that wait for the disk: 340 MB of pairs of 1280 x 1024
-SLICE_S = 0.2  # of waiting for a frame
 MOST_OFF_NS = 1_000_000_000  # a frame that comes later than that is named; one that is stamped as much ahead shows a jump
-FIRST = 8  # frames of a device, of which one at least came without delay
 
 
 class Taken(NamedTuple):
@@ -81,9 +79,10 @@ class FrameStream:
 
     def _fetch(self) -> None:
         came = monotonic()
+        slice_s = 0.2  # of waiting for a frame
         try:
             while not self._ending.is_set():
-                taken = self._read(SLICE_S)
+                taken = self._read(slice_s)
                 if taken is None:
                     if monotonic() - came >= self._silent_s:
                         expected = f"expected a frame within {self._silent_s:g} s, found none"
@@ -155,7 +154,8 @@ class _Stamps:
 
     def _check(self, before: Taken, now: Taken, ahead_ns: int) -> None:
         back_ns = before.time_ns - now.time_ns
-        if back_ns >= 0 or (ahead_ns > MOST_OFF_NS and self._seen >= FIRST):
+        first = 8  # frames of a device, of which one at least came without delay
+        if back_ns >= 0 or (ahead_ns > MOST_OFF_NS and self._seen >= first):
             found = f"it {1e-9 * back_ns:.3f} s back" if back_ns >= 0 else f"it {1e-9 * ahead_ns:.3f} s ahead of arrival"
             expected = "a clock that goes on"
             raise DeviceError(f"{now.device}: expected {expected}, found {found} at frame {now.frame.number}; record anew")

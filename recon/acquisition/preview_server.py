@@ -20,11 +20,8 @@ from recon.acquisition.pictures import Over, Picture
 from recon.errors import InputError
 from recon.own_requests import FOREIGN, LOOPBACK, is_own
 
-MOST_SIDE_PX = 640  # of an image on the page
 MOST_VISITORS = 8  # at once
 PATIENCE_S = 5.0  # with a visitor who says nothing
-SAID = 20  # last lines that are shown
-ASKED, THERE = (0, 220, 255), (110, 220, 90)  # BGR, of the outline of a place, and of one that is reached
 
 
 class Preview:
@@ -43,8 +40,9 @@ class Preview:
 
     def say(self, text: str) -> None:
         """Show a line."""
+        said = 20  # last lines that are shown
         with self._lock:
-            self._said = [*self._said, text][-SAID:]
+            self._said = [*self._said, text][-said:]
 
     def state(self) -> dict[str, object]:
         """What there is to show, without images."""
@@ -63,7 +61,8 @@ class Preview:
         if picture is None:
             return None
         full = 2**picture.bits - 1
-        step = -(-max(picture.image.shape) // MOST_SIDE_PX)
+        most_side_px = 640  # of an image on the page
+        step = -(-max(picture.image.shape) // most_side_px)
         grey = picture.image[::step, ::step]
         shown = cv2.cvtColor(np.uint8(grey.astype(np.float32) * (255 / full)), cv2.COLOR_GRAY2BGR)
         shown[grey >= full] = (0, 0, 255)
@@ -79,7 +78,8 @@ def _way(picture: Picture) -> str:
 def _draw(shown: NDArray[np.uint8], over: Over, step: int) -> None:
     """Draw what lies over an image : (h, w, 3), of which each `step`th pixel is shown."""
     line, first = (np.rint(at / step).astype(np.int32) for at in (over.outline, over.first))
-    colour = THERE if over.there else ASKED
+    asked, there = (0, 220, 255), (110, 220, 90)  # BGR, of the outline of a place, and of one that is reached
+    colour = there if over.there else asked
     cv2.polylines(shown, [line], isClosed=True, color=colour, thickness=2, lineType=cv2.LINE_AA)
     cv2.circle(shown, (int(first[0]), int(first[1])), 5, colour, -1, cv2.LINE_AA)
 

@@ -6,6 +6,7 @@ manifest, exchanged in one step, names a part as soon as there is something of i
 folder is opened for the next recording.
 """
 
+import errno
 import logging
 import os
 import re
@@ -20,17 +21,16 @@ import cv2
 import numpy as np
 from pydantic import ValidationError
 
-from recon.acquisition.growing_table import GrowingTable, mend
 from recon.capture import calibration_files, manifest, probe_files, writer
 from recon.capture.images import PNG_ENCODER, Images, Size, write_images
 from recon.capture.manifest import BoardPart, Device, Manifest, PartName, Purpose, SurfacePart, SweepPart, image_name
+from recon.capture.sweep_tables import STAMPS
 from recon.errors import InputError, one_line
 from recon.files import atomic, written_files
 from recon.model.boards import Board
 from recon.model.patterns import Patterns
 
 log = logging.getLogger(__name__)
-
 SURFACE, BOARD = "surface", "board"
 RECORD = "record"  # who writes
 FRAME_FILE = re.compile(rf"\.?(\d+\.png|{re.escape(manifest.STAMPS)})(\.part)?")  # of a sweep's device
@@ -222,7 +222,7 @@ class Recording:
                 for leftover in (self.folder / folder).glob(".*.part"):
                     leftover.unlink()
                 table = self.folder / folder / manifest.STAMPS
-                if table.is_file() and (torn := mend(table)):
+                if table.is_file() and (torn := mend_table(table)):
                     log.warning("%s: mended: the last row, of which %d bytes had been written, is left out", table, torn)
 
 
@@ -323,3 +323,41 @@ def _write_whole(path: Path, data: bytes | np.ndarray) -> None:
 
 def _entries(folder: Path) -> list[Path]:
     return sorted(folder.iterdir()) if folder.is_dir() else []
+
+
+class GrowingTable:
+    """`timestamps.csv` of one device, as `recon.capture.sweep_tables.read_stamps` reads it, a row at a time."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
+        self._head = ",".join(STAMPS) + "\n"
+
+    def append(self, frame: int, time_ns: int) -> None:
+        """Add a row, in one call of the system; OSError if it doesn't fit on the disk, and the table stays as it was."""
+        row = f"{self._head}{frame},{time_ns}\n".encode("ascii")
+        before = os.fstat(self._file).st_size
+        try:
+            if os.write(self._file, row) < len(row):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
+        except OSError as error:
+            os.ftruncate(self._file, before)
+            error.filename = str(self._path)
+            raise
+        self._head = ""
+
+    def close(self) -> None:
+        """Close the file; may be called again."""
+        if self._file >= 0:
+            os.close(self._file)
+        self._file = -1
+
+
+def mend_table(path: Path) -> int:
+    """Cut a table after its last whole row; returns the number of bytes that went."""
+    with path.open("r+b") as stream:
+        content = stream.read()
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            stream.truncate(whole)
+    return len(content) - whole

@@ -16,9 +16,6 @@ from recon.acquisition.still_session import StillSession
 from recon.devices.pattern_player import Pattern, Stage
 from recon.model.patterns import Patterns
 
-STILL = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
-GRAIN_PX = 8  # blocks whose means are compared, so that noise counts little
-
 
 @dataclass(frozen=True)
 class SurfacePlan:
@@ -68,10 +65,11 @@ def _faults(session: StillSession, plan: SurfacePlan, taken: dict[str, NDArray])
 
 def _moved(before: dict[str, NDArray], after: dict[str, NDArray]) -> list[str]:
     """Faults of what moved, or was covered, while the fringes were taken."""
+    still = 0.02  # relative RMS change of the lit image, beyond noise, between before the sequence and after it
     return [
         f"{name} moved: its image changed by {100 * change:.1f} % meanwhile; lay all things still"
         for name in before
-        if (change := changed(before[name], after[name])) > STILL
+        if (change := changed(before[name], after[name])) > still
     ]
 
 
@@ -82,5 +80,6 @@ def changed(before: NDArray, after: NDArray) -> float:
 
 
 def _blocks(image: NDArray) -> NDArray[np.float64]:
-    height, width = (side - side % GRAIN_PX for side in image.shape)
-    return image[:height, :width].reshape(height // GRAIN_PX, GRAIN_PX, width // GRAIN_PX, GRAIN_PX).mean(axis=(1, 3))
+    grain_px = 8  # blocks whose means are compared, so that noise counts little
+    height, width = (side - side % grain_px for side in image.shape)
+    return image[:height, :width].reshape(height // grain_px, grain_px, width // grain_px, grain_px).mean(axis=(1, 3))

@@ -21,8 +21,6 @@ from recon.capture.manifest import CAMERAS, Device, Purpose
 from recon.devices.interfaces import Frame, Scanner, Trigger
 
 POLL_S = 0.05  # of what the operator says, and of streams that ended
-LOOK_S = 1.0  # between two looks at the frames, which cost a tenth of a second each
-AGAIN_S = 5.0  # before the same fault is said again
 WORDS: dict[Purpose | None, str] = {
     "probe": "lead the probe about the crossed wires: from many sides, tilted and turned, the crossing in the image",
     "latency": "move the probe up and down over the tank's flat bottom, quickly, for ten seconds",
@@ -114,7 +112,8 @@ class _Shown:
 
     def look(self, latest: Mapping[str, Frame]) -> None:
         """Look at the latest frames, at most once in a while, and say what is wrong with them."""
-        if not latest or monotonic() - self._looked < LOOK_S:
+        look_s = 1.0  # between two looks at the frames, which cost a tenth of a second each
+        if not latest or monotonic() - self._looked < look_s:
             return
         for device, frame in latest.items():
             bits = self.devices[device].bits
@@ -131,7 +130,8 @@ class _Shown:
 
     def _say(self, fault: str) -> None:
         kind = fault.partition(":")[0]
-        if monotonic() - self._said.get(kind, -AGAIN_S) >= AGAIN_S:
+        again_s = 5.0  # before the same fault is said again
+        if monotonic() - self._said.get(kind, -again_s) >= again_s:
             self._said[kind] = monotonic()
             self.say(fault)
 

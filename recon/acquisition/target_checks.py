@@ -10,30 +10,25 @@ from recon.tracking import photographs
 from recon.tracking.networks import Networks
 from recon.tracking.rims import WHOLE
 
-MOST_MOTION_PX = 8.0  # of a circle over an exposure: what the tracker was measured with, and some more
 Judged = tuple[str, tuple[str, ...]]  # figures, and faults with the ways to mend them
 Judge = Callable[[NDArray, int], Judged]  # of an image : (h, w) and its bits
-
-TURN = "turn the target's face to both cameras, within their views, and uncover its circles"
 
 
 def target_judge(networks: Networks, target: Target) -> Judge:
     """Give a judge of camera frames."""
+    most_motion_px = 8.0  # of a circle over an exposure: what the tracker was measured with, and some more
+
+    turn = "turn the target's face to both cameras, within their views, and uncover its circles"
 
     def judge(image: NDArray, bits: int) -> Judged:
         view = photographs.find(image, networks, target, bits if bits > 8 else None)
         if not view.found:
-            return "no target", (f"target not found: {view.reason}; {TURN}",)
+            return "no target", (f"target not found: {view.reason}; {turn}",)
         moved, seen = float(np.nanmax(view.blur_px)), view.outlines.seen
         text = f"target found, moved by {moved:.1f} px"
-        if moved > MOST_MOTION_PX:
+        if moved > most_motion_px:
             return text, (f"target blurred by {moved:.0f} px; lead it more slowly, or expose shorter under more light",)
         covered = [f"c{k}" for k in np.flatnonzero(seen < WHOLE)]
         return text, (f"{' and '.join(covered)} partly covered; move hand and cable off the target",) if covered else ()
 
     return judge
-
-
-def unjudged(image: NDArray, bits: int) -> Judged:
-    """Say nothing, where no target is expected."""
-    return "", ()

@@ -8,14 +8,14 @@ from recon.board_detection.checkerboard import TAG_FAMILY, charuco_of
 from recon.model.boards import AprilGrid, Board, Charuco, Chessboard, Squares
 
 QUIET = 0.4  # of a step of the pattern, clear around it
-LEAST_QUIET_MM = 6.0
 CAPTION_BAND_MM = CAPTION_MM + 2.2
 
 
 def card_of(board: Board) -> Card:
     """Draw a board, upright: its first point is above, at the left."""
     low, high = _extent(board)
-    quiet = max(QUIET * _step(board), LEAST_QUIET_MM)
+    least_quiet_mm = 6.0
+    quiet = max(QUIET * _step(board), least_quiet_mm)
     size = (float(high[0] - low[0]) + 2 * quiet, float(high[1] - low[1]) + 2 * quiet)
     origin = np.array([quiet - low[0], CAPTION_BAND_MM + quiet + high[1]])  # of the board's frame, of which y runs down
     sized = (size[0], size[1] + CAPTION_BAND_MM)

@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 Size = tuple[float, float]  # width, height, mm
 
 MARK = b"% sonotwin sha256 "  # of all before it, by which a sheet as it was written is known
-POINT_MM = 25.4 / 72  # PDF's unit
 PAPERS: dict[str, Size] = {  # upright, the smallest first
     "a4": (210.0, 297.0),
     "letter": (215.9, 279.4),
@@ -29,15 +28,9 @@ PAPERS: dict[str, Size] = {  # upright, the smallest first
     "a0": (841.0, 1189.0),
 }
 RULER_MM = 100.0
-RULER_TEXT = "print at 100 %; this must be 100.0 mm"
 LEFT_MM = 10.0  # beside the card, for the upright ruler
 BELOW_MM = 17.0  # below the card, for the other ruler and the small print beside it
-PRINT_MM = 80.0  # width of the small print, at least
-MARKS_MM = 5.0  # around the card, for the cut marks
-MARK_GAP_MM, MARK_MM = 1.0, 4.0  # from the card to a mark, and its length
-HAIRLINE_MM = 0.1
 FONT, BOLD, FONT_MM = "Helvetica", "Helvetica-Bold", 2.2  # 6.2 points
-LEADING_MM = 2.7
 CAPTION_MM = 1.8  # height of the letters on the card
 
 
@@ -67,8 +60,10 @@ class Sheet(NamedTuple):
 
 def needed(card: Size, margin_mm: float) -> Size:
     """Size of the paper that a card of a size needs, with rulers, marks and a margin on which no printer prints."""
-    width = max(card[0] + 2 * MARKS_MM, RULER_MM + PRINT_MM)
-    return 2 * margin_mm + LEFT_MM + width, 2 * margin_mm + BELOW_MM + max(card[1] + 2 * MARKS_MM, RULER_MM)
+    marks_mm = 5.0  # around the card, for the cut marks
+    print_mm = 80.0  # width of the small print, at least
+    width = max(card[0] + 2 * marks_mm, RULER_MM + print_mm)
+    return 2 * margin_mm + LEFT_MM + width, 2 * margin_mm + BELOW_MM + max(card[1] + 2 * marks_mm, RULER_MM)
 
 
 def lay_out(card: Size, paper: Size, margin_mm: float) -> Sheet | None:
@@ -93,12 +88,14 @@ def write(path: Path, card: Card, sheet: Sheet, margin_mm: float, title: str, li
     ----------
     lines : the small print, of which the first is bold
     """
-    canvas = Canvas(str(path), pagesize=(sheet.paper[0] / POINT_MM, sheet.paper[1] / POINT_MM), invariant=1)
+    point_mm = 25.4 / 72  # PDF's unit
+    canvas = Canvas(str(path), pagesize=(sheet.paper[0] / point_mm, sheet.paper[1] / point_mm), invariant=1)
     canvas.setTitle(title)
     canvas.setCreator("sonotwin")
     canvas.setViewerPreference("PrintScaling", "None")  # so that viewers offer 100 % first
-    canvas.scale(1 / POINT_MM, 1 / POINT_MM)
-    canvas.setLineWidth(HAIRLINE_MM)
+    canvas.scale(1 / point_mm, 1 / point_mm)
+    hairline_mm = 0.1
+    canvas.setLineWidth(hairline_mm)
     _draw_card(canvas, card, sheet.card)
     _draw_marks(canvas, card.size, sheet.card)
     _draw_rulers(canvas, (margin_mm + LEFT_MM, margin_mm + BELOW_MM))
@@ -139,10 +136,11 @@ def _draw_card(canvas: Canvas, card: Card, at: Size) -> None:
 
 
 def _draw_marks(canvas: Canvas, size: Size, at: Size) -> None:
+    mark_gap_mm, mark_mm = 1.0, 4.0  # from the card to a mark, and its length
     for x, way_x in ((at[0], -1), (at[0] + size[0], 1)):
         for y, way_y in ((at[1], -1), (at[1] + size[1], 1)):
-            canvas.line(x + MARK_GAP_MM * way_x, y, x + (MARK_GAP_MM + MARK_MM) * way_x, y)
-            canvas.line(x, y + MARK_GAP_MM * way_y, x, y + (MARK_GAP_MM + MARK_MM) * way_y)
+            canvas.line(x + mark_gap_mm * way_x, y, x + (mark_gap_mm + mark_mm) * way_x, y)
+            canvas.line(x, y + mark_gap_mm * way_y, x, y + (mark_gap_mm + mark_mm) * way_y)
 
 
 def _draw_rulers(canvas: Canvas, corner: Size) -> None:
@@ -166,14 +164,16 @@ def _draw_ruler(canvas: Canvas, way: int) -> None:
     for mm in range(0, int(RULER_MM) + 1, 10):
         canvas.drawCentredString(mm, start + way * 3.6 - beyond, str(mm))
     canvas.setFont(BOLD, FONT_MM)
-    canvas.drawCentredString(RULER_MM / 2, start + way * 6.2 - beyond, RULER_TEXT)
+    ruler_text = "print at 100 %; this must be 100.0 mm"
+    canvas.drawCentredString(RULER_MM / 2, start + way * 6.2 - beyond, ruler_text)
 
 
 def _write_lines(canvas: Canvas, lines: Sequence[str], at: Size, width: float) -> None:
     """Small print from a point downwards, the first line bold."""
     x, y = at
+    leading_mm = 2.7
     for font, line in zip((BOLD, *[FONT] * len(lines)), lines, strict=False):
         canvas.setFont(font, FONT_MM)
         for part in simpleSplit(line, font, FONT_MM, width):
             canvas.drawString(x, y, part)
-            y -= LEADING_MM
+            y -= leading_mm

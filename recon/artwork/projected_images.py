@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from recon.model.patterns import AnyPart, CentreLine, Fringes, GrayCode, Patterns, Uniform
 
 FULL = 255  # of 8 bits, as projectors take them
-FEW_STEPS = 5  # fewer bend the phase by the second or third harmonic, which a projector's gamma adds
 
 
 class Shown(NamedTuple):
@@ -49,7 +48,8 @@ def shown(patterns: Patterns) -> list[Shown]:
 def bent_by_gamma(patterns: Patterns) -> int:
     """Steps of the set of grey fringes that suffers most from a projector's gamma; 0 if none does."""
     sets = [part.steps for part in patterns.parts if isinstance(part, Fringes) and part.waveform == "sine"]
-    few = [steps for steps in sets if steps < FEW_STEPS]
+    few_steps = 5  # fewer bend the phase by the second or third harmonic, which a projector's gamma adds
+    few = [steps for steps in sets if steps < few_steps]
     return min(few, default=0)
 
 

@@ -11,8 +11,6 @@ from recon.errors import InputError
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Target
 
-LEAST_WHITE_MM = 2.0  # between a rim and the card's edge: there the rim's grey levels are measured
-
 
 def card_of(target: Target) -> Card:
     """Draw a target of the size of its board.
@@ -25,7 +23,8 @@ def card_of(target: Target) -> Card:
     centres = circle_centres(target)[:, :2]
     radius = target.outer_diameter_mm / 2
     low, high = centres.min(axis=0) - radius, centres.max(axis=0) + radius
-    least = high - low + 2 * LEAST_WHITE_MM
+    least_white_mm = 2.0  # between a rim and the card's edge: there the rim's grey levels are measured
+    least = high - low + 2 * least_white_mm
     if (least > target.board_mm).any():
         found, expected = (f"{x:g}x{y:g}" for x, y in (target.board_mm, least.tolist()))
         raise InputError(f"rig.target.board_mm: expected {expected} mm or more around these circles, found {found} mm")

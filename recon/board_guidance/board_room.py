@@ -21,11 +21,8 @@ BLUR_PX = {"camera": 2.5, "projector": 5.0}  # disc of a point out of focus; the
 SHARP_PX = {"camera": 1.0, "projector": 5.0}  # where things are measured, not just calibrated
 FARTHEST = 3.0  # times the distance in focus, however small the aperture
 LEVELS = 3  # of distance: both ends of the reach tell most, and the middle
-FULL = 0.5  # share of candidates that are tilted as far as allowed; the rest half as much, or not at all
-WAYS = 8  # directions to tilt to
 ALIKE_MM, ALIKE_DEG = 10.0, 4.0  # from an earlier pose: what isn't noise, as the board's bend, errs in the same way there
 BATCH, BATCHES = 1000, 20  # places drawn at once, and times at most
-STEPS = 8  # points a side of an outline: lenses bend it
 
 
 def _near_to_far(depths: tuple[float, float]) -> tuple[float, float]:
@@ -106,7 +103,8 @@ def outline(board: Board) -> Array:
     points = board.points()[:, :2]
     low, high = points.min(axis=0) - board.rim_mm, points.max(axis=0) + board.rim_mm
     corners = np.array([low, (high[0], low[1]), high, (low[0], high[1]), low])
-    along = np.arange(STEPS)[:, None] / STEPS
+    steps = 8  # points a side of an outline: lenses bend it
+    along = np.arange(steps)[:, None] / steps
     sides = [start + along * (end - start) for start, end in pairwise(corners)]
     return np.pad(np.concatenate(sides), ((0, 0), (0, 1)))
 
@@ -182,8 +180,10 @@ def _drawn(board: Board, camera: Camera, reach: Reach, rng: np.random.Generator)
     depth = rng.choice(np.linspace(*reach.depth_mm, LEVELS), BATCH)
     rays = camera.rays(rng.uniform(size=(BATCH, 2)) * (np.array(camera.size) - 1.0))
     at = camera.centre + rays * ((depth - camera.centre[2]) / rays[:, 2])[:, None]
-    turn, way = np.pi / 2 * rng.integers(2, size=BATCH), 2 * np.pi / WAYS * rng.integers(WAYS, size=BATCH)
-    share = rng.choice([1.0, 0.5, 0.0], BATCH, p=[FULL, (1 - FULL) / 2, (1 - FULL) / 2])
+    ways = 8  # directions to tilt to
+    turn, way = np.pi / 2 * rng.integers(2, size=BATCH), 2 * np.pi / ways * rng.integers(ways, size=BATCH)
+    full = 0.5  # share of candidates that are tilted as far as allowed; the rest half as much, or not at all
+    share = rng.choice([1.0, 0.5, 0.0], BATCH, p=[full, (1 - full) / 2, (1 - full) / 2])
     tilt = np.deg2rad(reach.tilt_deg) * share
     none = np.zeros(BATCH)
     tilts = Rotation.from_rotvec(tilt[:, None] * np.column_stack([np.cos(way), np.sin(way), none]))

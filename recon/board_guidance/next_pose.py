@@ -16,8 +16,6 @@ from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 
 CANDIDATES = 600  # from which the best one is chosen
-OFF = 2.5  # times the distance of poses that are alike: that of asked poses from earlier ones
-FEW_POINTS = 24  # of a board: so many stand for all of a larger one
 NOISE_PX = {"cam1": 0.01, "cam2": 0.01, "projector": 0.01}  # of a sighting before any was measured; rendered boards have half
 
 
@@ -92,13 +90,15 @@ def described(rig: Rig, names: Collection[str]) -> dict[str, Camera]:
 def _unlike(choice: Array, poses: Array, board: Board) -> Array:
     """Those of poses : (m, 4, 4) to choose from that are unlike all earlier ones : (p, 4, 4), though held a little off."""
     apart_mm, apart_deg = apart(choice, poses, board)
-    new = ((apart_mm > OFF * ALIKE_MM) | (apart_deg > OFF * ALIKE_DEG)).all(axis=1)
+    off = 2.5  # times the distance of poses that are alike: that of asked poses from earlier ones
+    new = ((apart_mm > off * ALIKE_MM) | (apart_deg > off * ALIKE_DEG)).all(axis=1)
     return choice[new] if new.any() else choice
 
 
 def few(points: Array) -> Array:
     """Points : (m, 3) mm that stand for all of a board : (n, 3) mm, evenly chosen; all of a small one."""
-    return points[np.unique(np.linspace(0, len(points) - 1, min(FEW_POINTS, len(points))).round().astype(int))]
+    few_points = 24  # of a board: so many stand for all of a larger one
+    return points[np.unique(np.linspace(0, len(points) - 1, min(few_points, len(points))).round().astype(int))]
 
 
 def in_image(camera: Camera, pose: Array, board: Board) -> tuple[Array, Array]:

@@ -27,7 +27,6 @@ from recon.optical_calibration.observations import PROJECTOR
 Array = NDArray[np.float64]
 Free = Mapping[str, Sequence[str]]
 
-FOCAL, CENTRE_PX, TURN_RAD, SHIFT_MM = 0.1, 100.0, 0.1, 50.0  # standard deviations of what a rig's description says
 DEPTHS = 3  # of the working volume
 
 
@@ -79,8 +78,9 @@ def of_calibration(known: Calibration, noise: Mapping[str, float], depths: tuple
 
 def _described(camera: Camera, names: Sequence[str]) -> Array:
     """Standard deviations : (g,) of parameters of which a rig's description is all that is known."""
-    spread = {"fx": FOCAL * camera.matrix[0, 0], "fy": FOCAL * camera.matrix[1, 1], "cx": CENTRE_PX, "cy": CENTRE_PX}
-    spread |= dict(zip(MOTION, 3 * [TURN_RAD] + 3 * [SHIFT_MM], strict=True))
+    focal, centre_px, turn_rad, shift_mm = 0.1, 100.0, 0.1, 50.0  # standard deviations of what a rig's description says
+    spread = {"fx": focal * camera.matrix[0, 0], "fy": focal * camera.matrix[1, 1], "cx": centre_px, "cy": centre_px}
+    spread |= dict(zip(MOTION, 3 * [turn_rad] + 3 * [shift_mm], strict=True))
     spread |= dict(zip(names, usual_lenses.largest(camera, names).tolist(), strict=True)) | spread
     return np.array([spread[name] for name in names])
 

@@ -22,7 +22,6 @@ from recon.optical_calibration.observations import Observations, Size
 from recon.optical_calibration.optical_checks import FEWEST_POSES
 from recon.optical_calibration.sightings import ENOUGH, Sighting, gather
 
-SURE_FOCAL = 0.02  # relative standard deviation of focal lengths from which on the poses are trusted more than the description
 BAD_POSE = 5.0  # times the noise: as in `joint_calibration`
 
 
@@ -109,7 +108,9 @@ def _is_sure(found: Calibration) -> bool:
     """Whether all focal lengths are known better than from a description."""
     assert found.uncertainty is not None
     focal = [(found.uncertainty.sigma(f"{name}.fx"), camera.matrix[0, 0]) for name, camera in found.cameras.items()]
-    return all(sigma < SURE_FOCAL * length for sigma, length in focal)
+    # relative standard deviation of focal lengths from which on the poses are trusted more than the description
+    sure_focal = 0.02
+    return all(sigma < sure_focal * length for sigma, length in focal)
 
 
 def _noise(observations: Observations, found: Adjustment) -> dict[str, float]:

@@ -6,11 +6,12 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.board_guidance.board_blur import blur
 from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, Reach, apart, candidates, reach_of
 from recon.board_guidance.next_pose import CANDIDATES, few, knowledge
 from recon.board_guidance.pose_progress import BAD_POSE, SoFar, held, with_sighting
@@ -18,10 +19,7 @@ from recon.geometry.camera import Array
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Sighting
 
-LEAST_SHARE = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
-BLURRED_PX = 3.0  # standard deviation, in the softest direction
-SMEARED = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
-MOVED_PX = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
+STEEPEST = 0.998  # quantile of the slopes: discs of 20 px radius have 1 % of all pixels on edges of one direction
 
 
 @dataclass(frozen=True)
@@ -85,11 +83,13 @@ def _camera_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
     """What is wrong with the cameras' images, the gravest first."""
     sighting = observation.sighting
     yield from (_not_found(device, sighting) for device in so_far.sizes if device != PROJECTOR and device not in sighting.pixels)
+    blurred_px = 3.0  # standard deviation, in the softest direction
+    smeared = 2.0, 0.5  # softest over sharpest direction, and px on top: beyond, the board moved while the camera exposed
     for device, image in observation.lit.items():
-        found = blur(image, sighting.pixels[device])
-        if found.most > SMEARED[0] * found.least + SMEARED[1]:
+        found = board_blur(image, sighting.pixels[device])
+        if found.most > smeared[0] * found.least + smeared[1]:
             yield f"{device}: smeared by {found.most:.1f} px: the board moved during the exposure; rest it, or expose shorter"
-        elif found.most > BLURRED_PX:
+        elif found.most > blurred_px:
             yield f"{device}: blurred by {found.most:.1f} px: out of focus; hold it nearer to the middle distance, or focus"
 
 
@@ -98,11 +98,12 @@ def _later_faults(observation: Observation, so_far: SoFar) -> Iterator[str]:
     sighting = observation.sighting
     if PROJECTOR in so_far.sizes and PROJECTOR not in sighting.pixels:
         yield _not_found(PROJECTOR, sighting)
+    moved_px = 0.1  # median of the points, from the first frame to the last: twenty times the noise of a disc's centre
     for device, pixels in observation.again.items():
         away = np.linalg.norm(pixels - sighting.pixels[device], axis=1)
         if np.isnan(away).all():
             yield f"{device}: the board was out of sight after the last frame; rest it on something, until all is taken"
-        elif (moved := float(np.nanmedian(away))) > MOVED_PX:
+        elif (moved := float(np.nanmedian(away))) > moved_px:
             yield f"{device}: the board moved by {moved:.2f} px between the first frame and the last; rest it on something"
 
 
@@ -131,7 +132,8 @@ def _too_alike(pose: Array, so_far: SoFar, gain: float, asked: float | None, rea
     if apart_mm[nearest] < ALIKE_MM and apart_deg[nearest] < ALIKE_DEG:
         away = f"{apart_mm[nearest]:.0f} mm and {apart_deg[nearest]:.0f} deg from it"
         return f"too like pose {so_far.sightings[nearest].name}, {away}: {adds}; hold it as shown"
-    return None if gain >= LEAST_SHARE * best else f"{adds}; hold it as shown"
+    least_share = 0.7  # of what the asked pose would add; an earlier pose once more adds half of it, by averaging noise
+    return None if gain >= least_share * best else f"{adds}; hold it as shown"
 
 
 def _best_gain(so_far: SoFar, reach: Reach) -> float:
@@ -150,3 +152,34 @@ def _disagreement(so_far: SoFar, extended: SoFar) -> str | None:
         return None
     device = list(so_far.sizes)[int(np.argmax(times))]
     return f"{device}: contradicts the other poses by {times.max():.0f} times the noise: the board moved between frames; rest it"
+
+
+class Blur(NamedTuple):
+    """Standard deviations of the blur, px."""
+
+    least: float  # in the sharpest direction
+    most: float  # in the softest
+
+
+def board_blur(image: NDArray, pixels: Array) -> Blur:
+    """Blur of the image : (h, w) of a board whose points lie at pixels : (n, 2), NaN where not seen.
+
+    An edge of contrast C that is blurred by s has the steepest slope `C / (sqrt(2 pi) s)` across it.
+    """
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    around = 0.1  # of the points' extent, beyond them
+    beyond = around * np.ptp(seen, axis=0)
+    left, top = np.maximum(seen.min(axis=0) - beyond, 0).astype(int)
+    right, low = (seen.max(axis=0) + beyond + 2).astype(int)
+    smoothing = 1.0  # px, standard deviation: taken out of the blur again
+    level = cv2.GaussianBlur(np.float32(image[top:low, left:right]), (0, 0), smoothing)
+    across, down = (cv2.Sobel(level, cv2.CV_32F, du, dv, ksize=1, scale=0.5) for du, dv in ((1, 0), (0, 1)))
+    dark, bright = 0.05, 0.95  # quantiles of the levels, both of which a board has many of
+    contrast = float(np.subtract(*np.quantile(level, [bright, dark])))
+    widths = []
+    directions = 4  # over half a turn
+    for way in np.pi / directions * np.arange(directions):
+        steepest = float(np.quantile(np.abs(np.cos(way) * across + np.sin(way) * down), STEEPEST))
+        width = contrast / (np.sqrt(2 * np.pi) * max(steepest, 1e-9))
+        widths.append(np.sqrt(max(width**2 - smoothing**2, 0.0)))
+    return Blur(min(widths), max(widths))

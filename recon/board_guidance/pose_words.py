@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from recon.board_guidance.board_room import Array, half_turn_is_alike, middles
 from recon.model.boards import Board
 
-THERE_MM, THERE_DEG = 15.0, 8.0  # from the asked pose: near enough; nobody holds a board better
 ROUND_MM, ROUND_DEG = 10, 5  # that a person can tell
 
 
@@ -44,7 +43,8 @@ def there(asked: Array, held: Array, board: Board) -> bool:
     """Whether a pose that is held is near enough to the one asked for."""
     turn = Rotation.from_rotvec(np.deg2rad([0, 0, 180]) * half_turn_is_alike(board)).as_matrix()
     apart = min(Rotation.from_matrix(asked[:3, :3].T @ held[:3, :3] @ again).magnitude() for again in (np.eye(3), turn))
-    return bool(np.linalg.norm(_shift(asked, held, board)) <= THERE_MM and np.rad2deg(apart) <= THERE_DEG)
+    there_mm, there_deg = 15.0, 8.0  # from the asked pose: near enough; nobody holds a board better
+    return bool(np.linalg.norm(_shift(asked, held, board)) <= there_mm and np.rad2deg(apart) <= there_deg)
 
 
 def angles(pose: Array) -> Array:

@@ -36,7 +36,6 @@ from recon.model.lengths import UNIT_KEY
 log = logging.getLogger(__name__)
 
 MM = 1000.0  # in a m
-OF_FILES = (".cameramodel", ".yaml", ".yml")  # of one camera each
 DEVICES = {
     "cam1": "cam1",
     "left": "cam1",
@@ -45,8 +44,6 @@ DEVICES = {
     "projector": "projector",
 }  # by words in files and topics
 FROM_0 = {"cam0": "cam1", "cam1": "cam2", "projector": "projector"}  # where one is cam0
-FEW_DIGITS = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
-LARGEST = 1e8  # px, of a focal length; and of any coefficient
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,4})?"
 
 
@@ -71,7 +68,8 @@ class Content:
 
     def of_cameras(self, tells: Callable[[str], bool]) -> dict[Path, str]:
         """Texts of one camera each: of the file, or of a folder's, those of which a dialect tells that they are its own."""
-        return {file: text for file, text in self.texts(*OF_FILES).items() if tells(text)}
+        of_files = (".cameramodel", ".yaml", ".yml")  # of one camera each
+        return {file: text for file, text in self.texts(*of_files).items() if tells(text)}
 
     @property
     def is_matlab(self) -> bool:
@@ -233,10 +231,12 @@ def of_stored(path: Path, stored: Mapping[str, Stored]) -> Calibration:
 
 def camera(path: Path, name: str, size: tuple[int, int], matrix: Array, distortion: Array, camera_from_world: Array) -> Camera:
     """A device; InputError if a number is too large, or its pose no rotation and shift."""
+    largest = 1e8  # px, of a focal length; and of any coefficient
     for part, values in (("matrix", matrix), ("distortion", distortion)):
-        if (np.abs(values) > LARGEST).any():
-            raise InputError(f"{path}: {name}.{part}: expected numbers of up to {LARGEST:g}, found {np.abs(values).max():g}")
-    if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, FEW_DIGITS):
+        if (np.abs(values) > largest).any():
+            raise InputError(f"{path}: {name}.{part}: expected numbers of up to {largest:g}, found {np.abs(values).max():g}")
+    few_digits = 1.1e-5  # of a rotation's products, in any of the files: five decimals mostly pass
+    if rigid.fault(camera_from_world, ROTATION) and not rigid.fault(camera_from_world, few_digits):
         camera_from_world = rigid.nearest(camera_from_world)
     try:
         return Camera(size, matrix, distortion, camera_from_world)

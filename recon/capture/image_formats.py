@@ -24,10 +24,7 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 KINDS = f"an image ({', '.join(SUFFIXES)})"
 MOST_PX = 1 << 26  # of an image
-MOST_CHANNELS = 4
 PNG_BEGIN = b"\x89PNG\r\n\x1a\n"
-PNG_CHUNKS = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
-PNG_DEPTH, PNG_COLOUR = 24, 25  # places of bytes
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # numbers a pixel, by the kind of colour
 JPEG_BEGIN, NEXT_IMAGE, JPEG_END = b"\xff\xd8\xff", b"\xd8", b"\xd9"
 JPEG_MARKER = re.compile(rb"\xff+([\x02-\xcf\xd8-\xfe])")  # neither a number of the pixels' nor a mark between these
@@ -36,10 +33,7 @@ READERS = {  # by the beginnings of files
     JPEG_BEGIN: JpegImagePlugin.JpegImageFile,
     b"BM": BmpImagePlugin.BmpImageFile,
 }
-TIFF_BEGINNINGS = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # the last two of BigTIFF, with places of 64 bits
 TIFF_NUMBERS = {3: "H", 4: "L", 16: "Q"}  # by the type of a field
-MOST_FIELDS = 4096
-TIFF_WIDTH, TIFF_HEIGHT, TIFF_CHANNELS = 256, 257, 277  # tags
 MODES = {"1": "L", "LA": "L"}  # of Pillow's, that become grey; all others become colours
 DAMAGE = (  # what Pillow raises on files damaged at random
     *(OSError, SyntaxError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError),
@@ -62,11 +56,12 @@ def decode_image(path: Path, data: bytes) -> Pixels:
     if data.startswith(PNG_BEGIN):
         data = _without_remarks(path, data)
     size_of(path, io.BytesIO(data))
+    png_depth, png_colour = 24, 25  # places of bytes
     if data.startswith(PNG_BEGIN):
         pixels = _by_pillow(path, data)
         if not pixels[-1].any():
             _check_rows(path, data)
-        deep = data[PNG_DEPTH] == 16 and data[PNG_COLOUR] != 0
+        deep = data[png_depth] == 16 and data[png_colour] != 0
         return _by_opencv(path, data) if deep else pixels  # which was whole, so that OpenCV's library has nothing to say
     if data.startswith(JPEG_BEGIN):
         if not _ends(data):
@@ -98,7 +93,8 @@ def size_of(path: Path, stream: BinaryIO) -> tuple[int, int]:
     """
     start = stream.read(len(PNG_BEGIN))
     stream.seek(0)
-    width, height = _size_of_tiff(path, stream) if start.startswith(TIFF_BEGINNINGS) else _opened(path, stream).size
+    tiff_beginnings = b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"  # the last two of BigTIFF, with places of 64 bits
+    width, height = _size_of_tiff(path, stream) if start.startswith(tiff_beginnings) else _opened(path, stream).size
     if not 0 < width * height <= MOST_PX:
         raise InputError(f"{path}: expected an image of up to {MOST_PX} px, found {width}x{height}")
     return width, height
@@ -126,6 +122,7 @@ def _without_remarks(path: Path, data: bytes) -> bytes:
     Others may be odd, or unpack to any size. Source: W3C, Portable Network Graphics, third edition.
     """
     kept, position, kind = [PNG_BEGIN], len(PNG_BEGIN), b""
+    png_chunks = (b"IHDR", b"PLTE", b"IDAT", b"IEND")  # that pixels are made of
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data.ljust(position + 8, b"\0"), position)
         end = position + 12 + length
@@ -133,7 +130,7 @@ def _without_remarks(path: Path, data: bytes) -> bytes:
             raise InputError(f"{path}: expected a whole PNG image, found it cut short at {len(data)} bytes")
         if zlib.crc32(memoryview(data)[position + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             raise InputError(f"{path}: expected a whole PNG image, found damaged data at byte {position}")
-        if kind in PNG_CHUNKS:
+        if kind in png_chunks:
             kept.append(data[position:end])
         position = end
     return b"".join(kept)
@@ -160,8 +157,10 @@ def _size_of_tiff(path: Path, stream: BinaryIO) -> tuple[int, int]:
         fields = _fields_of_tiff(stream)
     except (struct.error, OverflowError, ValueError, OSError):
         fields = {}
-    width, height, channels = fields.get(TIFF_WIDTH, 0), fields.get(TIFF_HEIGHT, 0), fields.get(TIFF_CHANNELS, 1)
-    if not (width > 0 and height > 0 and 0 < channels <= MOST_CHANNELS):
+    tiff_width, tiff_height, tiff_channels = 256, 257, 277  # tags
+    width, height, channels = fields.get(tiff_width, 0), fields.get(tiff_height, 0), fields.get(tiff_channels, 1)
+    most_channels = 4
+    if not (width > 0 and height > 0 and 0 < channels <= most_channels):
         raise InputError(f"{path}: expected {KINDS}, found other or damaged data")
     return width, height
 
@@ -177,7 +176,8 @@ def _fields_of_tiff(stream: BinaryIO) -> dict[int, int]:
     stream.seek(struct.unpack_from(order + place, start, 8 if big else 4)[0])
     (count,) = struct.unpack(order + length, stream.read(struct.calcsize(order + length)))
     size = struct.calcsize(order + field)
-    entries = stream.read(min(count, MOST_FIELDS) * size)
+    most_fields = 4096
+    entries = stream.read(min(count, most_fields) * size)
     entries = entries[: len(entries) // size * size]
     return {
         tag: struct.unpack_from(order + TIFF_NUMBERS[kind], value)[0]

@@ -85,7 +85,7 @@ def read_images(folder: Path, projector_size: Size = PROJECTOR_SIZE) -> tuple[ND
     return images, sequence, mask
 
 
-class Mark(Part):
+class _Mark(Part):
     """Content of `MARKER`."""
 
     layout: Literal["meza2021"] = "meza2021"
@@ -108,7 +108,7 @@ def new_folder(folder: Path) -> Iterator[Path]:
 
 def mark(folder: Path, speed_m_s: float | None = None) -> None:
     """Write what makes a folder one of ours, with the speed of sound that its `US_params.npz` is right for."""
-    (folder / MARKER).write_text(Mark(speed_m_s=speed_m_s).model_dump_json(exclude_none=True) + "\n", encoding="utf-8")
+    (folder / MARKER).write_text(_Mark(speed_m_s=speed_m_s).model_dump_json(exclude_none=True) + "\n", encoding="utf-8")
 
 
 def speed_of(folder: Path) -> float | None:
@@ -120,7 +120,7 @@ def speed_of(folder: Path) -> float | None:
         If our file is damaged, or can't be read.
     """
     path = folder / MARKER
-    return validated(Mark, json_text.read(path), path).speed_m_s if path.is_file() else None
+    return validated(_Mark, json_text.read(path), path).speed_m_s if path.is_file() else None
 
 
 def is_theirs(surface: SurfaceCapture) -> bool:

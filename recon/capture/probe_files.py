@@ -40,11 +40,7 @@ SCHEMA = "sonotwin-probe/1"
 PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 AUTHORS = "US_params.npz"
 AS_NPZ = f"give it as {AUTHORS} with sx, sy, T_I_T and"  # a plain matrix, for what there is no place in it
-MOST_ROWS = 1e5  # of a scanner's image
-PLUS_ENDS = ("Image", "Probe")
 SEPARATORS = bytes.maketrans(b",;[]()", b"      ")
-RIGID_SCALE = 1e-6  # by which the axes of a rigid transform are off a length of 1
-MOST_OFF_DEG = 0.1  # of an image's axes, before it is said
 
 
 def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
@@ -68,13 +64,14 @@ def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
 def _plain_matrix(path: Path) -> tuple[str, Array] | None:
     """A matrix (4, 4) with its name, of a text of 16 numbers or a configuration of PLUS; None of any other file."""
     text = read_bytes(path, opencv_storage.MOST_BYTES, "a probe's calibration").lstrip()
+    plus_ends = ("Image", "Probe")
     if text.startswith(b"<") and b"opencv_storage" not in text:
-        found = [each for each in xml_text.read(path).iter("Transform") if (each.get("From"), each.get("To")) == PLUS_ENDS]
+        found = [each for each in xml_text.read(path).iter("Transform") if (each.get("From"), each.get("To")) == plus_ends]
         if len(found) != 1:
             raise InputError(
-                f"{path}: expected one Transform from {' to '.join(PLUS_ENDS)}, the probe's calibration, found {len(found)}"
+                f"{path}: expected one Transform from {' to '.join(plus_ends)}, the probe's calibration, found {len(found)}"
             )
-        text, name = (found[0].get("Matrix") or "").encode(), "To".join(PLUS_ENDS)
+        text, name = (found[0].get("Matrix") or "").encode(), "To".join(plus_ends)
     else:
         name = "matrix"
     words = text.translate(SEPARATORS).split()
@@ -96,14 +93,16 @@ def _of_matrix(path: Path, name: str, matrix: Array, speed_m_s: float | None) ->
         raise InputError(
             f"{path}: {name}: expected 4x4 finite numbers with a last row of 0 0 0 1, from pixels to mm, found others"
         )
-    if np.abs(scale - 1).max() < RIGID_SCALE:
+    rigid_scale = 1e-6  # by which the axes of a rigid transform are off a length of 1
+    if np.abs(scale - 1).max() < rigid_scale:
         expected = "first columns as long as the mm of a pixel"
         raise InputError(f"{path}: {name}: expected {expected}, found a rigid transform: multiply them by sx and sy in mm/px")
     if found := lengths.axes_fault(matrix):
         raise InputError(f"{path}: {name}: expected an image with square axes, found {found}")
     across, down = (matrix[:3, :2] / scale).T
     pose = rigid.nearest(rigid.transform(np.column_stack([across, down, np.cross(across, down)]), matrix[:3, 3]))
-    if (off := np.degrees(abs(np.arcsin(across @ down)))) > MOST_OFF_DEG:
+    most_off_deg = 0.1  # of an image's axes, before it is said
+    if (off := np.degrees(abs(np.arcsin(across @ down)))) > most_off_deg:
         log.warning(
             "%s: %s: axes are %.1f degrees off a right angle, and are taken as square; `config` keeps them", path, name, off
         )
@@ -192,7 +191,8 @@ def _checked(path: Path, name: str, read: ProbeCalibration, stated: object, way:
         raise InputError(f"{path}: {name}: expected {rigid.RIGID}, in mm, found {found}")
     if scale.shape != (2,) or not np.isfinite(scale).all() or scale.min() <= 0:
         raise InputError(f"{path}: scale: expected sx and sy above zero in mm/px, found {scale.tolist()}")
-    if not abs(read.face_row) < MOST_ROWS:
+    most_rows = 1e5  # of a scanner's image
+    if not abs(read.face_row) < most_rows:
         raise InputError(f"{path}: face_row: expected a row of an image, found {read.face_row:g}")
     if stated is not None:
         return _in_mm(path, read, lengths.unit_of(path, stated))

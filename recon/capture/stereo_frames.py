@@ -24,9 +24,6 @@ from recon.threads import mapped
 log = logging.getLogger(__name__)
 
 AT_ONCE = 2  # pairs that are read, while one more waits or is worked on
-ALONE_NS = 33_000_000  # taken for the period where a single frame tells none
-NEAR = 0.75  # of a period, that frames of a pair are apart at most: half, where cameras run freely, and their jitter
-MOST_ALONE = 0.25  # share of a camera's frames that may be without a partner
 APART, APART_NS = 0.1, 2_000_000  # of the period, and in time, that pairs are apart before it is said
 Pair = tuple[Images, Images]
 
@@ -111,8 +108,11 @@ def _partners(
     """
     times = [table[1] for table in tables]
     periods = [float(np.median(np.diff(each))) for each in times if len(each) > 1]
-    period = min(periods) if periods else ALONE_NS
-    first, second = _matched(times[0], times[1], NEAR * period)
+    alone_ns = 33_000_000  # taken for the period where a single frame tells none
+    period = min(periods) if periods else alone_ns
+    near = 0.75  # of a period, that frames of a pair are apart at most: half, where cameras run freely, and their jitter
+    first, second = _matched(times[0], times[1], near * period)
+    most_alone = 0.25  # share of a camera's frames that may be without a partner
     for one, other, paired in ((0, 1, first), (1, 0, second)):
         alone = np.setdiff1d(np.arange(len(times[one])), paired)
         ended = alone.tolist() == [len(times[one]) - 1] and times[one][-1] > times[other][-1]  # between both cameras
@@ -120,8 +120,8 @@ def _partners(
             continue
         k = int(alone[0])
         away = abs(int(times[other][_nearest(times[one][[k]], times[other])[0]]) - int(times[one][k])) * 1e-6
-        if len(alone) > MOST_ALONE * len(times[one]):
-            wanted = f"a frame of its own within {NEAR * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
+        if len(alone) > most_alone * len(times[one]):
+            wanted = f"a frame of its own within {near * period * 1e-6:.1f} ms of {CAMERAS[one]}'s frame {tables[one][0][k]}"
             counts = " and ".join(f"{len(each)} frames of {name}" for each, name in zip(times, CAMERAS, strict=True))
             found = f"the nearest {away:.1f} ms away ({len(alone)} such, in {counts})"
             raise InputError(

@@ -27,7 +27,6 @@ TRIANGLE = np.triu_indices(6)
 COVARIANCE, SHARED = (tuple(f"{letter}{row}{column}" for row, column in zip(*TRIANGLE, strict=True)) for letter in "cs")
 TRACK = ("time_ns", "found", *POSE)
 PAIRS = (*POSE, "u", "v")
-LONGEST_NS = 1 << 63
 
 
 def read_stamps(path: Path) -> tuple[NDArray[np.int64], Times]:
@@ -144,11 +143,12 @@ def _read(path: Path, header: Sequence[str], *optional: Sequence[str]) -> tuple[
 
 
 def _whole(path: Path, line: int, name: str, word: str) -> int:
+    longest_ns = 1 << 63
     try:
         value = int(word)
     except ValueError:
-        value = LONGEST_NS
-    if abs(value) >= LONGEST_NS:
+        value = longest_ns
+    if abs(value) >= longest_ns:
         raise InputError(f"{path}: line {line}: {name}: expected a whole number, found {brief(word)}")
     return value
 

@@ -31,14 +31,10 @@ from recon.files.regular import check_there, opened
 Dataset = Any
 Result = TypeVar("Result")
 
-MOST_FRAMES = 1_000_000
-MOST_BYTES = 1 << 33
 MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
-PREAMBLE, PREFIX = 128, b"DICM"
 META = 2  # group of the tags before the part that may be packed
 
 LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
-TWO_D, TISSUE, CENTIMETRES = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
 DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or compressed in ways that need other packages
     *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
     *(RuntimeError, TypeError, ValueError, struct.error, zlib.error, MemoryError, NotImplementedError),
@@ -64,14 +60,15 @@ def read(path: Path) -> Clip:
 
 def _clip(path: Path) -> Clip:
     header = _dataset(path, stop_before_pixels=True)
-    check_compression(path, header.file_meta.get("TransferSyntaxUID"))
+    _check_compression(path, header.file_meta.get("TransferSyntaxUID"))
     count = int(header.get("NumberOfFrames") or 1)
-    if not 1 <= count <= MOST_FRAMES:
+    most_frames = 1_000_000
+    if not 1 <= count <= most_frames:
         raise ValueError(f"NumberOfFrames {count}")
     size = int(header.Columns), int(header.Rows)
     if not 0 < size[0] * size[1] <= MOST_PX:
         raise ValueError(f"images of {size[0]}x{size[1]}")
-    seconds, region = times(header, count), b_scan_region(header)
+    seconds, region = times(header, count), _b_scan_region(header)
     image, scale = (None, None) if region is None else within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, size, count, timed, lambda: images(path, size, count), image, scale)
@@ -97,7 +94,7 @@ def images(path: Path, size: tuple[int, int], count: int) -> Iterator[NDArray[np
         raise InputError(f"{path}: expected {count} frames, as NumberOfFrames says, found {read}")
 
 
-def check_compression(path: Path, syntax: UID | None) -> None:
+def _check_compression(path: Path, syntax: UID | None) -> None:
     """InputError if pixels are compressed in a way that can't be read here."""
     if syntax is None or not syntax.is_transfer_syntax or not syntax.is_encapsulated or syntax in LOSSLESS:
         return
@@ -136,7 +133,8 @@ def _lossless(header: Dataset, count: int) -> Iterator[NDArray]:
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
     """Read a file; one that is packed as a whole, which may unpack to more than any memory, up to a bound."""
-    with opened(path, MOST_BYTES) as stream:
+    most_bytes = 1 << 33
+    with opened(path, most_bytes) as stream:
         return pydicom.dcmread(_plain(path, stream), stop_before_pixels=stop_before_pixels)
 
 
@@ -145,8 +143,9 @@ def _plain(path: Path, stream: BinaryIO) -> BinaryIO:
 
     Source: DICOM PS3.5, A.5: raw deflate behind the tags of group 2.
     """
-    stream.seek(PREAMBLE)
-    if stream.read(len(PREFIX)) == PREFIX:
+    preamble, prefix = 128, b"DICM"
+    stream.seek(preamble)
+    if stream.read(len(prefix)) == prefix:
         meta = read_dataset(stream, is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != META)
         if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
             length = stream.tell()
@@ -193,11 +192,12 @@ def times(header: Dataset, count: int) -> NDArray[np.float64] | None:
     return np.arange(count) * (step if step > 0 else 1 / rate)
 
 
-def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
+def _b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | None:
     """The largest two-dimensional region of tissue, and its scale in mm/px; None where the file has none."""
     best: tuple[Box, tuple[float, float] | None] | None = None
+    two_d, tissue, centimetres = 1, 1, 3  # RegionSpatialFormat, RegionDataType, PhysicalUnits
     for one in header.get("SequenceOfUltrasoundRegions") or []:
-        if int(one.RegionSpatialFormat) != TWO_D or int(one.get("RegionDataType", TISSUE)) != TISSUE:
+        if int(one.RegionSpatialFormat) != two_d or int(one.get("RegionDataType", tissue)) != tissue:
             continue
         left, top = int(one.RegionLocationMinX0), int(one.RegionLocationMinY0)
         box = left, top, int(one.RegionLocationMaxX1) - left + 1, int(one.RegionLocationMaxY1) - top + 1
@@ -205,7 +205,7 @@ def b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | N
             continue
         units = {int(one.get(f"PhysicalUnits{axis}Direction", 0)) for axis in "XY"}
         x, y = (10 * abs(float(one.get(f"PhysicalDelta{axis}", 0))) for axis in "XY")
-        scale = (x, y) if units == {CENTIMETRES} and x > 0 and y > 0 else None
+        scale = (x, y) if units == {centimetres} and x > 0 and y > 0 else None
         if best is None or box[2] * box[3] > best[0][2] * best[0][3]:
             best = box, scale
     return best

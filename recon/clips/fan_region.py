@@ -13,18 +13,8 @@ from recon.model.fan import STEEPEST_DEG, Fan, Mask, box
 Array = NDArray[np.float64]
 
 EXPECTED = "expected a part between two sides and two arcs that changes from frame to frame"
-FIELD = "fan=[u,v,first,last,left,right]"
-LEAST_DEG = 5.0  # between the sides
-LEAST_ROWS = 20  # of a side
-TRIED_ROWS = 60  # of a side, through each two of which a line is laid
-NEAR_PX = 2.0  # of a side
-STRAIGHT = 0.5  # share of a side's rows near its line
-RINGING_DN = 8.0  # of the face, in the mean over time
 STIRS_DN = 0.3  # standard deviation over time, of what is dark but no border
 WITHIN = 0.9  # share of the changing part in the fan
-COVERED = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
-EDGE_PX = 12  # of the image, within which an arc may be cut off
-BINS = 60  # of directions, in each of which the fan's first and last radius are taken
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
@@ -39,8 +29,9 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         If nothing of some size changes, or what does is no fan.
     """
     mean, deviation = image_region.over_time(frames)
-    part = image_region.changing(deviation, name, FIELD)
-    expected = f"{EXPECTED}; give {FIELD}, or clip=[{','.join(map(str, box(part)))}], a rectangle about it"
+    field = "fan=[u,v,first,last,left,right]"
+    part = image_region.changing(deviation, name, field)
+    expected = f"{EXPECTED}; give {field}, or clip=[{','.join(map(str, box(part)))}], a rectangle about it"
     rows = np.flatnonzero(part.any(axis=1))
     left, right = part[rows].argmax(axis=1), part.shape[1] - 1 - part[rows, ::-1].argmax(axis=1)
     sides = [_side(rows, left.astype(float)), _side(rows, -right.astype(float))]
@@ -48,7 +39,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
         raise InputError(f"{name}: {expected}, found one without straight sides")
     (slope, start), (mirrored, end) = (side for side in sides if side is not None)
     left_deg, right_deg = np.rad2deg(np.arctan([slope, -mirrored]))
-    if right_deg - left_deg <= LEAST_DEG or max(-left_deg, right_deg) > STEEPEST_DEG:
+    least_deg = 5.0  # between the sides
+    if right_deg - left_deg <= least_deg or max(-left_deg, right_deg) > STEEPEST_DEG:
         raise InputError(f"{name}: {expected}, found sides at {left_deg:.0f} and {right_deg:.0f} deg")
     v = (start + end) / -(slope + mirrored)
     u = start + slope * v
@@ -57,7 +49,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
     fan = replace(before, first_px=_face(mean, before), last_px=_end(deviation, replace(before, last_px=last)))
     inside = fan.mask((part.shape[0], part.shape[1]))
     within, stirring = inside[part].mean(), (deviation > STIRS_DN)[inside].mean()
-    if within < WITHIN or stirring < COVERED:
+    covered = 0.6  # share of the fan that stirs; black water doesn't, nor do shadows
+    if within < WITHIN or stirring < covered:
         found = f"{100 * within:.0f} % of it in a fan, of which {100 * stirring:.0f} % change"
         raise InputError(f"{name}: {expected}, found {found}")
     return fan
@@ -65,7 +58,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str) -> Fan:
 
 def _face(mean: NDArray[np.float32], before: Fan) -> float:
     """Radius at which the face's ringing begins in the mean image, before the arc where changes do; there, if nothing rings."""
-    ringing = np.flatnonzero(_shares(mean > RINGING_DN, before) > 0.5)
+    ringing_dn = 8.0  # of the face, in the mean over time
+    ringing = np.flatnonzero(_shares(mean > ringing_dn, before) > 0.5)
     return float(ringing[0]) if ringing.size else before.last_px
 
 
@@ -90,15 +84,19 @@ def _side(rows: NDArray[np.int64], outermost: Array) -> tuple[float, float] | No
     Rows where the side is dark lie within it, be they as many as half of them.
     """
     count = int(outermost.argmin()) + 1
-    if count < LEAST_ROWS:
+    least_rows = 20  # of a side
+    if count < least_rows:
         return None
     rows, outermost = rows[:count], outermost[:count]
-    tried = np.linspace(0, count - 1, min(TRIED_ROWS, count)).astype(int)
+    tried_rows = 60  # of a side, through each two of which a line is laid
+    tried = np.linspace(0, count - 1, min(tried_rows, count)).astype(int)
     one, other = tried[np.transpose(np.triu_indices(len(tried), 1))].T
     slopes = (outermost[other] - outermost[one]) / (rows[other] - rows[one])
-    near = np.abs(outermost - outermost[one, None] - slopes[:, None] * (rows - rows[one, None])) < NEAR_PX
+    near_px = 2.0  # of a side
+    near = np.abs(outermost - outermost[one, None] - slopes[:, None] * (rows - rows[one, None])) < near_px
     most = near[near.sum(axis=1).argmax()]
-    if most.mean() < STRAIGHT:
+    straight = 0.5  # share of a side's rows near its line
+    if most.mean() < straight:
         return None
     start, slope = np.polynomial.polynomial.polyfit(rows[most], outermost[most], 1)
     return float(slope), float(start)
@@ -108,10 +106,12 @@ def _radii(part: Mask, u: float, v: float) -> tuple[float, float]:
     """Radii of both arcs: the medians over directions of the first and the last pixel, where the image doesn't end before."""
     y, x = np.nonzero(part)
     radius, angle = np.hypot(x - u, y - v), np.arctan2(x - u, y - v)
-    place = np.digitize(angle, np.linspace(*np.quantile(angle, [0.02, 0.98]), BINS))
+    bins = 60  # of directions, in each of which the fan's first and last radius are taken
+    place = np.digitize(angle, np.linspace(*np.quantile(angle, [0.02, 0.98]), bins))
     ends = np.array([np.quantile(radius[place == k], [0.002, 0.998]) for k in np.unique(place)[1:-1]])
     directions = np.array([angle[place == k].mean() for k in np.unique(place)[1:-1]])
     across, down = u + np.sin(directions) * ends[:, 1], v + np.cos(directions) * ends[:, 1]
-    free = (across > EDGE_PX) & (across < part.shape[1] - EDGE_PX) & (down < part.shape[0] - EDGE_PX)
+    edge_px = 12  # of the image, within which an arc may be cut off
+    free = (across > edge_px) & (across < part.shape[1] - edge_px) & (down < part.shape[0] - edge_px)
     last = np.median(ends[free, 1]) if free.any() else ends[:, 1].max()
     return float(np.median(ends[:, 0])), float(last)

@@ -10,11 +10,6 @@ from recon.clips.clip import Box
 from recon.errors import InputError
 from recon.model.fan import Mask, box
 
-CHANGES_DN = 4.0  # standard deviation of a pixel over time: speckle has ten and more, compressed rests less
-JOIN_PX = 9  # gaps in what changes, such as dark tissue, that are closed
-LEAST_SHARE = 0.05  # of the screen
-WHOLE = 0.9  # share of the screen along both sides, from which on nothing is cut away
-
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
     """The box about the largest part that changes, from frames : (h, w) of one size.
@@ -29,17 +24,21 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
     _, deviation = over_time(frames)
     part = changing(deviation, name, field)
     (tall, wide), (u, v, width, height) = part.shape, box(part)
-    return (0, 0, wide, tall) if width > WHOLE * wide and height > WHOLE * tall else (u, v, width, height)
+    whole = 0.9  # share of the screen along both sides, from which on nothing is cut away
+    return (0, 0, wide, tall) if width > whole * wide and height > whole * tall else (u, v, width, height)
 
 
 def changing(deviation: NDArray[np.float32], name: str, field: str) -> Mask:
     """The largest part that changes : (h, w), its gaps closed, by `over_time`; InputError if nothing of some size does."""
-    changes = deviation > CHANGES_DN
-    joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((JOIN_PX, JOIN_PX), np.uint8))
-    opened = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((JOIN_PX, JOIN_PX), np.uint8))
+    changes_dn = 4.0  # standard deviation of a pixel over time: speckle has ten and more, compressed rests less
+    changes = deviation > changes_dn
+    join_px = 9  # gaps in what changes, such as dark tissue, that are closed
+    joined = cv2.morphologyEx(changes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((join_px, join_px), np.uint8))
+    opened = cv2.morphologyEx(joined, cv2.MORPH_OPEN, np.ones((join_px, join_px), np.uint8))
     count, labels, figures, _ = cv2.connectedComponentsWithStats(opened)
     largest = int(figures[1:, cv2.CC_STAT_AREA].argmax()) + 1 if count > 1 else 0
-    if largest == 0 or figures[largest, cv2.CC_STAT_AREA] < LEAST_SHARE * changes.size:
+    least_share = 0.05  # of the screen
+    if largest == 0 or figures[largest, cv2.CC_STAT_AREA] < least_share * changes.size:
         raise InputError(f"{name}: expected a B-scan that changes from frame to frame, found none; give {field}")
     return labels == largest
 

@@ -16,7 +16,6 @@ from recon.compiled import njit
 Codes = NDArray[np.uint16]  # (65536,) length and number of bits that follow, 256 length + bits, by the next 16 bits; 0: none
 
 START, FRAME, CODES, SCAN, RESTART_INTERVAL, END = 0xD8, 0xC3, 0xC4, 0xDA, 0xDD, 0xD9
-OTHER_FRAMES = (0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
 PREDICTORS = range(1, 8)
 MOST_BITS = 16  # of a code, of a sample and of a difference
 
@@ -40,9 +39,10 @@ def decode(data: bytes) -> NDArray[np.uint16]:
     """
     frame, codes, restart, samples = None, {}, 0, np.empty((0, 0, 0), np.uint16)
     seen = set()
+    other_frames = (0xC0, 0xC1, 0xC2, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF)
     for marker, begin, end in _segments(data):
         content = data[begin:end]
-        if marker in OTHER_FRAMES:
+        if marker in other_frames:
             raise ValueError(f"a JPEG image of another process, SOF{marker - 0xC0}, than the lossless one")
         if marker == FRAME:
             frame = _frame(content)

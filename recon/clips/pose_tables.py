@@ -23,9 +23,7 @@ Array = NDArray[np.float64]
 
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-SEPARATORS = ",;\t"  # else blanks
 MOST_SECONDS = 9e9  # of a time stamp, that nanoseconds of 64 bits can hold
-LAST_ROW = 1e-6  # by which a matrix' last row may be off 0 0 0 1
 MOST_OFF = 0.02  # of a rotation from the nearest exact one
 
 Column = Annotated[str, BeforeValidator(lambda value: str(value) if type(value) is int else value)]  # a name, or a number from 1
@@ -139,7 +137,8 @@ def _pose(path: Path, line: int, values: Array, columns: Columns) -> Array:
         pose[:3, :3] = _rotation(path, line, values[3:])
     pose[:3, 3] *= MILLIMETRES[columns.length_unit]
     nearest, last = rigid.nearest(pose), np.abs(pose[3] - [0, 0, 0, 1]).max()
-    if np.linalg.det(nearest[:3, :3]) < 0 or np.abs(nearest - pose).max() > MOST_OFF or last > LAST_ROW:
+    last_row = 1e-6  # by which a matrix' last row may be off 0 0 0 1
+    if np.linalg.det(nearest[:3, :3]) < 0 or np.abs(nearest - pose).max() > MOST_OFF or last > last_row:
         raise InputError(
             f"{path}: line {line}: expected {rigid.RIGID}, row by row, found {rigid.fault(pose) or 'another matrix'}"
         )
@@ -157,10 +156,11 @@ def _rotation(path: Path, line: int, values: Array) -> Array:
 
 def _numbers(path: Path, names: Names, timed: bool) -> tuple[list[int], Array]:
     """Numbers of lines, and values : (n, k) of columns; NaN of empty cells, but none of the first column if it is the time."""
+    separators = ",;\t"  # else blanks
     try:
         text = read_bytes(path, MOST_TABLE).decode("utf-8-sig")
         first = text.partition("\n")[0]
-        separator = next((one for one in SEPARATORS if one in first), " ")
+        separator = next((one for one in separators if one in first), " ")
         parsed = csv.reader(text.splitlines(), delimiter=separator, skipinitialspace=True)
         rows = [row for row in enumerate(parsed, start=1) if any(row[1]) or (len(row[1]) > 1 and not timed)]
     except (UnicodeDecodeError, csv.Error):

@@ -21,17 +21,11 @@ from recon.devices.genicam_features import Features, Value, said_by, words
 from recon.devices.interfaces import DeviceError, Frame, Size, Trigger
 
 LOG = logging.getLogger(__name__)
-BUFFERS = 32  # of pylon's, filled by the driver while this thread waits for a core
 SLICE_MS = 100  # of waiting, after which an end or an unplugged cable is noticed
-READY_MS = 5000  # for which a camera may be busy before a software trigger is given up; exposures last up to some seconds
 FORMATS = {8: "Mono8", 10: "Mono10", 12: "Mono12"}
 EDGES = {"rising": "RisingEdge", "falling": "FallingEdge"}
-WRAP = 65535  # numbers 1 to 65535 of cameras of Gigabit Ethernet; they never use 0
-NO_NUMBER = 2**64 - 1
 NS_PER_S = 10**9
-UNPLUGGED = "unplugged; check cable and power, then open it again"
 EXPOSURE = ("ExposureTime", "ExposureTimeAbs")
-CHUNKS = ("ExposureTime", "PayloadCRC16")  # sent along with images by cameras that can
 
 
 @dataclass(frozen=True)
@@ -120,10 +114,11 @@ class BaslerCamera:
         from pypylon import pylon
 
         self._raise_failure()
+        ready_ms = 5000  # for which a camera may be busy before a software trigger is given up; exposures last up to some seconds
         with said_by(self.name):
             waits = self._device.CanWaitForFrameTriggerReady()
-            if waits and not self._device.WaitForFrameTriggerReady(READY_MS, pylon.TimeoutHandling_Return):
-                raise DeviceError(f"{self.name}: not ready for a trigger after {READY_MS / 1000:g} s; started with `software`?")
+            if waits and not self._device.WaitForFrameTriggerReady(ready_ms, pylon.TimeoutHandling_Return):
+                raise DeviceError(f"{self.name}: not ready for a trigger after {ready_ms / 1000:g} s; started with `software`?")
             self._device.ExecuteSoftwareTrigger()
 
     def frame(self, timeout_s: float) -> Frame | None:
@@ -188,11 +183,12 @@ class BaslerCamera:
     def _open(self) -> None:
         self._device = self._connect()
         self._features = Features(self.name, self._device)
+        buffers = 32  # of pylon's, filled by the driver while this thread waits for a core
         with ExitStack() as stack:
             stack.callback(self._quietly, self._device.Close)
             with said_by(self.name):
                 self._device.Open()
-                self._device.MaxNumBuffer.SetValue(BUFFERS)
+                self._device.MaxNumBuffer.SetValue(buffers)
             self._set_up()
             stack.pop_all()  # it is open, and `close` gives it back
 
@@ -232,7 +228,8 @@ class BaslerCamera:
             return
         self._features.put(True, "ChunkModeActive")
         offered = self._features.choices("ChunkSelector")
-        for chunk in [name for name in CHUNKS if name in offered]:
+        chunks = ("ExposureTime", "PayloadCRC16")  # sent along with images by cameras that can
+        for chunk in [name for name in chunks if name in offered]:
             self._features.put(chunk, "ChunkSelector")
             self._features.put(True, "ChunkEnable")
         self._features.put(bool(offered), "ChunkModeActive")
@@ -262,6 +259,7 @@ class BaslerCamera:
         from pypylon import genicam, pylon
 
         number, failure = self._first_number - 1, "stopped taking frames"
+        unplugged = "unplugged; check cable and power, then open it again"
         try:
             while not self._ending.is_set() and not self._device.IsCameraDeviceRemoved():
                 result = self._device.RetrieveResult(SLICE_MS, pylon.TimeoutHandling_Return)
@@ -273,7 +271,7 @@ class BaslerCamera:
             failure = words(error)
         finally:
             if not self._ending.is_set():
-                self._fail(UNPLUGGED if self._device.IsCameraDeviceRemoved() else failure)
+                self._fail(unplugged if self._device.IsCameraDeviceRemoved() else failure)
 
     def _keep(self, result: Any, number: int) -> None:
         """Take a result into the queue, or say why its frame is lost."""
@@ -332,11 +330,13 @@ def unwrapped(block: int, last: int, first: int) -> int:
 
     A camera that doesn't number its frames gets them counted.
     """
-    if block == NO_NUMBER:
+    no_number = 2**64 - 1
+    if block == no_number:
         return last + 1
-    if first == 0 or block > WRAP:
+    wrap = 65535  # numbers 1 to 65535 of cameras of Gigabit Ethernet; they never use 0
+    if first == 0 or block > wrap:
         return block
-    return last + (block - last - 1) % WRAP + 1
+    return last + (block - last - 1) % wrap + 1
 
 
 def open_camera(name: str, serial: str, settings: BaslerSettings | None = None) -> BaslerCamera:

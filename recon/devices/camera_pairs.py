@@ -14,7 +14,6 @@ from recon.devices.interfaces import Camera, Frame, Trigger
 from recon.devices.timed_frames import FrameTimes
 
 LOG = logging.getLogger(__name__)
-SLICE_S = 0.05  # of waiting for one camera, after which the other's frames are fetched
 HELD = 64  # frames of a camera that wait for the other's
 
 Cause = Literal["lost", "alone"]
@@ -157,9 +156,10 @@ class CameraPair:
     def pair(self, timeout_s: float) -> Pair | None:
         """Wait for the next pair, in order; None if none came in time. DeviceError if a camera is gone or its clock jumped."""
         until = monotonic() + timeout_s
+        slice_s = 0.05  # of waiting for one camera, after which the other's frames are fetched
         while (pair := self._queue.pair()) is None:
             behind = self._queue.behind()
-            self._fetch(behind, min(SLICE_S, max(0.0, until - monotonic())))
+            self._fetch(behind, min(slice_s, max(0.0, until - monotonic())))
             self._fetch(1 if behind == 0 else 0, 0.0)
             if monotonic() >= until:
                 return self._queue.pair()

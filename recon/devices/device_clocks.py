@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 from recon.devices.interfaces import Camera, DeviceError, Scanner
 
 LOG = logging.getLogger(__name__)
-CRYSTAL = 1e-4  # standard deviation of a rate about 1; quartz oscillators are within some tens of parts in a million
 FEWEST = 8  # frames for a first map while more come, and of a block
 BLOCKS = 12  # in each the fastest frame counts
-FEWEST_BLOCKS = 4  # for a rate
 WINDOW = 512  # frames that are looked back on: some seconds, in which a crystal's rate stays as it is
-REFIT = 16  # frames between two fits
-READINGS = 8  # of a device's clock, of which the fastest counts
 LATE = 64  # frames in a row that come late, most of them by the same time: no accident
 
 
@@ -110,21 +106,23 @@ def fit_clock(device_ns: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> Cl
     at, least = times[fastest], delays[fastest]
     middle = at.mean()
     spread = np.sum((at - middle) ** 2)
-    enough = len(at) >= FEWEST_BLOCKS
+    fewest_blocks = 4  # for a rate
+    enough = len(at) >= fewest_blocks
     slope = np.sum((at - middle) * least) / spread if enough else 0.0
     residuals = least - least.mean() - slope * (at - middle)
     scatter = float(np.sqrt(np.sum(residuals**2) / max(len(at) - 2, 1)))
     typical = float(np.median(delays - least.mean() - slope * (times - middle))) / np.log(2)  # mean of an exponential law
     late = typical * len(blocks) / len(times)  # of a block's fastest frame
     sigma = max(late, scatter)
-    held = spread / (spread + (sigma / CRYSTAL) ** 2) if enough else 0.0  # weight of the blocks beside what crystals do
+    crystal = 1e-4  # standard deviation of a rate about 1; quartz oscillators are within some tens of parts in a million
+    held = spread / (spread + (sigma / crystal) ** 2) if enough else 0.0  # weight of the blocks beside what crystals do
     lowest = least.mean() - late
     return ClockMap(
         reference + round(middle),
         arrival + round(middle + lowest),
         1 + held * slope,
         late + scatter if enough else typical if len(times) > 1 else np.inf,
-        CRYSTAL * float(np.sqrt(1 - held)),
+        crystal * float(np.sqrt(1 - held)),
     )
 
 
@@ -207,10 +205,11 @@ class ClockFollower:
     def _take(self, device_ns: int, arrived_ns: int) -> None:
         self._frames.append((device_ns, arrived_ns))
         self._until_fit -= 1
+        refit = 16  # frames between two fits
         if self._until_fit <= 0:
             self._edge = self._fit()
             self.clock = self._without_transfer(self._edge)
-            self._until_fit = REFIT if len(self._frames) > 2 * REFIT else FEWEST // 2
+            self._until_fit = refit if len(self._frames) > 2 * refit else FEWEST // 2
 
     def _fit(self) -> ClockMap:
         device, arrived = np.array(self._frames, np.int64).T
@@ -218,8 +217,9 @@ class ClockFollower:
 
     def _without_transfer(self, edge: ClockMap) -> ClockMap:
         """Take the least transfer out, by readings of the first moments; it is held when the window is full, or after a jump."""
+        readings = 8  # of a device's clock, of which the fastest counts
         if self._read is not None:
-            self._readings = [reading for reading in (self._read() for _ in range(READINGS)) if reading is not None]
+            self._readings = [reading for reading in (self._read() for _ in range(readings)) if reading is not None]
             self._read = None
         if self._readings:
             self._transfer = least_transfer(edge, self._readings)

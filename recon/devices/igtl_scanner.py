@@ -13,7 +13,6 @@ from recon.devices.scan_view import ScanView
 from recon.errors import InputError, short
 
 FIRST_S = 5.0  # in which an image must come after the scanner was opened
-DEPTHS = (8, 16)  # bits of grey levels
 
 
 class IgtlScanner:
@@ -44,8 +43,9 @@ class IgtlScanner:
         DeviceError
             If none comes in time; the message says what came instead.
         """
-        if not DEPTHS[0] <= bits <= DEPTHS[1]:
-            raise DeviceError(f"scanner {name}: bits: expected {DEPTHS[0]} to {DEPTHS[1]}, found {bits}")
+        depths = (8, 16)  # bits of grey levels
+        if not depths[0] <= bits <= depths[1]:
+            raise DeviceError(f"scanner {name}: bits: expected {depths[0]} to {depths[1]}, found {bits}")
         self.name, self._device, self._view, self._bits = name, device, view or ScanView(), bits
         self._client = Client(host, port, self._is_ours, check=check)
         first = self._client.receive(first_s)

@@ -14,9 +14,6 @@ from recon.devices.interfaces import Image
 
 Pattern = NDArray[np.uint8]
 
-FULL = 255.0  # level of a pattern
-TELLING = 1.0  # times the noise that a change must be for a verdict
-
 
 class Light(NamedTuple):
     """A projector's light in a camera's image, as mean squares over it."""
@@ -45,8 +42,10 @@ def change(light: Light, images: tuple[Image, Image], patterns: tuple[Pattern, P
         About 1, by the part of the projector that the camera sees and by gamma; 0 where the second pattern was not shown; NaN
         where the patterns differ too little for this light.
     """
-    expected = light.power * _mean_square(*patterns) / FULL**2
-    if expected <= TELLING * light.noise:
+    full = 255.0  # level of a pattern
+    expected = light.power * _mean_square(*patterns) / full**2
+    telling = 1.0  # times the noise that a change must be for a verdict
+    if expected <= telling * light.noise:
         return np.nan
     return max(_mean_square(*images) - light.noise, 0.0) / expected
 

@@ -27,8 +27,6 @@ Pattern = NDArray[np.uint8]
 
 TRIES = 3  # of a pattern
 DOUBLED = 0.1  # share of the expected change below which an image shows the pattern before; gamma and a part in view leave 0.2
-LEAST_LIGHT_DN = 2.0  # root mean square of white less black
-MOST_WAITING = 1000  # images of earlier light that are left out at most
 
 
 class Taking(Protocol):
@@ -179,7 +177,8 @@ def _take_changed(
 
 def _light_fault(name: str, light: Light) -> str:
     """What is wrong with a camera's view of the projector's light; nothing if it is seen."""
-    if light.power >= max(LEAST_LIGHT_DN**2, light.noise):
+    least_light_dn = 2.0  # root mean square of white less black
+    if light.power >= max(least_light_dn**2, light.noise):
         return ""
     return (
         f"{name}: expected the projector's light, found white {np.sqrt(light.power):.1f} DN brighter than black: "
@@ -219,7 +218,8 @@ def _take(stage: Stage, pattern: Pattern, what: str) -> _Taken:
 def _frame_after(camera: Camera, lit_ns: int, wait_frames: int, timeout_s: float) -> Frame | None:
     """The image that comes a number of images after the first one that arrived later than a time; None if it doesn't come."""
     first, end = None, time.monotonic() + timeout_s
-    for _ in range(MOST_WAITING):  # by number, not by time: of virtual cameras an image may take longer than life
+    most_waiting = 1000  # images of earlier light that are left out at most
+    for _ in range(most_waiting):  # by number, not by time: of virtual cameras an image may take longer than life
         frame = camera.frame(max(end - time.monotonic(), 0))
         if frame is None:
             return None

@@ -24,10 +24,8 @@ from recon.errors import InputError
 from recon.files.regular import check_there
 
 DELIVERY_NS = 10_000_000  # from the middle of an exposure to the image in memory: half of 10 ms, and 1.3 MB over USB 3
-MOST_APART, MOST_APART_S = 0.1, 1.0  # of the longest recording, and s beside it, that a device may begin or end after another
 CLOCKS = "clocks of their own? record them by one, as sonotwin record does"
 BUFFERED = 4  # frames that wait to be fetched
-MOST_KEPT = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,8 @@ class _Played:
         except InputError as error:
             raise DeviceError(f"{self.name}: {error}") from None
         image.flags.writeable = False
-        if (len(self._kept) + 1) * image.nbytes <= MOST_KEPT:
+        most_kept = 1 << 28  # bytes of a device's images that are kept in memory, so that later rounds read none
+        if (len(self._kept) + 1) * image.nbytes <= most_kept:
             self._kept[number] = image
         return image
 
@@ -202,7 +201,8 @@ def _check_ends(recorded: Mapping[str, Recorded], apart_s: float | None) -> None
     """Check that devices begin and end together; InputError as of `timeline_of`."""
     spans = {name: (int(each.times[0]), int(each.times[-1])) for name, each in recorded.items()}
     longest_s = max(last - first for first, last in spans.values()) / 1e9
-    most_s = MOST_APART * longest_s + MOST_APART_S if apart_s is None else apart_s
+    most_apart, most_apart_s = 0.1, 1.0  # of the longest recording, and s beside it, that a device may begin or end after another
+    most_s = most_apart * longest_s + most_apart_s if apart_s is None else apart_s
     found_s, word, late, early = max((_furthest(spans, end) for end in (0, 1)), key=itemgetter(0))
     if found_s > most_s:
         found = f"found {late} to {word} {found_s:.3g} s after {early}"

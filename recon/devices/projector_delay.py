@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from recon.devices.interfaces import Camera, DeviceError, Frame, Projector
 
 FLASHES = 16  # black and white in turn
-SETTLED = 0.02  # share of a step up to which a level is the new one
 LONGEST_S = 0.5  # that a projector may take, and a third more is watched
-LEAST_DN = 1.0  # step of the image's mean; smaller ones are left to the lamp's flicker
 
 
 class Watched(NamedTuple):
@@ -73,14 +71,16 @@ def frames_to_wait(
 def _settled(camera: Camera, series: list[Watched]) -> Iterator[tuple[Watched, int]]:
     """Each flash but the first, and the index of its first image from which on all show it."""
     ends = [float(np.median(watched.levels[-max(len(watched.levels) // 4, 1) :])) for watched in series]
+    settled = 0.02  # share of a step up to which a level is the new one
+    least_dn = 1.0  # step of the image's mean; smaller ones are left to the lamp's flicker
     for before, end, watched in zip(ends, ends[1:], series[1:], strict=False):
         step = abs(end - before)
-        if step < LEAST_DN:
+        if step < least_dn:
             raise DeviceError(
                 f"{camera.name}: expected flashes of the projector, found black and white {step:.1f} DN apart: is the lens "
                 "covered, the exposure too short, or the projector off?"
             )
-        first = int(np.flatnonzero(np.append(True, np.abs(watched.levels - end) > SETTLED * step))[-1])
+        first = int(np.flatnonzero(np.append(True, np.abs(watched.levels - end) > settled * step))[-1])
         if first == len(watched.levels) or watched.seconds[first] > LONGEST_S:
             raise DeviceError(
                 f"{camera.name}: expected a flash to settle within {LONGEST_S} s, found levels that still change: does the "

@@ -19,9 +19,6 @@ Array = NDArray[np.float64]
 
 STEPS = 17  # grey levels, of 8 bits: every 16th
 LIT = 0.25  # share of the brightest pixels' light from which on a pixel counts
-SATURATED = 0.98  # share of full scale
-BENT_PX = 0.05  # projector px by which fringes may bend before it is said
-GAMMAS = (0.2, 5.0)
 
 
 class Response(NamedTuple):
@@ -33,7 +30,8 @@ class Response(NamedTuple):
     @property
     def gamma(self) -> float:
         """The exponent of `light = level ** gamma`, by least squares."""
-        return float(minimize_scalar(lambda g: np.sum((self.levels**g - self.light) ** 2), bounds=GAMMAS).x)
+        gammas = (0.2, 5.0)
+        return float(minimize_scalar(lambda g: np.sum((self.levels**g - self.light) ** 2), bounds=gammas).x)
 
     @property
     def bend(self) -> float:
@@ -74,8 +72,9 @@ def response(levels: Array, images: Sequence[Image], full: float, name: str) -> 
     black, white = np.float32(images[0]), np.float32(images[-1])
     light = white - black
     lit = light > LIT * np.percentile(light, 99)
-    if np.mean(white[lit] >= SATURATED * full) > 0.01:
-        raise DeviceError(f"{name}: expected white below {SATURATED * full:.0f} DN, found it saturated: shorten the exposure")
+    saturated = 0.98  # share of full scale
+    if np.mean(white[lit] >= saturated * full) > 0.01:
+        raise DeviceError(f"{name}: expected white below {saturated * full:.0f} DN, found it saturated: shorten the exposure")
     total = light[lit].sum()
     if not total > 0:
         raise DeviceError(f"{name}: expected the projector's light, found white as dark as black: is the lens covered?")
@@ -99,7 +98,8 @@ def bent_fringes(measured: Response, patterns: Patterns) -> str:
     """One line on what a response does to a sequence, with the way on; empty where it does nothing."""
     errors = {fringe_error(measured, part): part for part in patterns.parts if isinstance(part, Fringes)}
     worst = max(errors, default=0.0)
-    if worst <= BENT_PX:
+    bent_px = 0.05  # projector px by which fringes may bend before it is said
+    if worst <= bent_px:
         return ""
     part = errors[worst]
     return (

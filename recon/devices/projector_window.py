@@ -31,9 +31,6 @@ log = logging.getLogger(__name__)
 Pattern = NDArray[np.uint8]
 
 DELAY_S = 0.1  # from drawing to light, if it wasn't measured: projectors take up to five images of 1/60 s
-PUMP_S = 0.1  # between looks at the system's messages; a window that leaves them unread for seconds is covered by some systems
-OPENING_S = 2.0  # that a window manager may take to place the window
-BENT = 2 / 255  # of full scale, by which a ramp may move a level
 
 
 class ProjectorWindow:
@@ -107,7 +104,9 @@ class ProjectorWindow:
             self._thread.submit(opening.result().close).result()
 
     def _keep_alive(self) -> None:
-        while not self._closing.wait(PUMP_S):
+        # between looks at the system's messages; a window that leaves them unread for seconds is covered by some systems
+        pump_s = 0.1
+        while not self._closing.wait(pump_s):
             with contextlib.suppress(RuntimeError):  # Python ends, and nobody has closed the window
                 self._thread.submit(self._canvas.read_messages)
 
@@ -183,7 +182,8 @@ class _Canvas:
 
     def _wait_for_place(self) -> None:
         """Give the window manager its time."""
-        end = time.monotonic() + OPENING_S
+        opening_s = 2.0  # that a window manager may take to place the window
+        end = time.monotonic() + opening_s
         while self._misplaced() and time.monotonic() < end:
             self.read_messages()
             time.sleep(0.01)
@@ -226,9 +226,10 @@ def _opened(screen: "Screen", display: Display) -> "pyglet.window.Window":
 def _warn_of_bending(screen: "Screen", display: Display) -> None:
     """Log what bends patterns but may be wanted, and what cannot be checked."""
     ramp = displays.gamma_ramp(screen)
+    bent = 2 / 255  # of full scale, by which a ramp may move a level
     if ramp is None:
         log.info("projector: the graphics card's ramp of display %s can't be read here; measure grey steps by a camera", display)
-    elif (off := displays.bent_by(ramp)) > BENT:
+    elif (off := displays.bent_by(ramp)) > bent:
         log.warning(
             "projector: the graphics card's ramp of display %s moves levels by up to %.0f of 255: switch off night light and "
             "colour profiles of this display, unless the ramp is there to make the projector linear",

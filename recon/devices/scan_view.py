@@ -14,7 +14,6 @@ from recon.devices.interfaces import DeviceError, Size
 
 TURNS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # steps along v and u that turn one into MF
 ORIENTATIONS = (*TURNS, *(name[::-1] for name in TURNS))  # those with lines of sound in rows are transposed before
-SCALES = (0.05, 4.0)
 
 
 @dataclass(frozen=True)
@@ -28,8 +27,9 @@ class ScanView:
     def __post_init__(self) -> None:
         if self.orientation not in ORIENTATIONS:
             raise DeviceError(f"orientation: expected one of {', '.join(ORIENTATIONS)}, found {self.orientation!r}")
-        if not SCALES[0] <= self.scale <= SCALES[1]:
-            raise DeviceError(f"scale: expected {SCALES[0]} to {SCALES[1]}, found {self.scale:g}")
+        scales = (0.05, 4.0)
+        if not scales[0] <= self.scale <= scales[1]:
+            raise DeviceError(f"scale: expected {scales[0]} to {scales[1]}, found {self.scale:g}")
         if self.crop and (min(self.crop) < 0 or 0 in self.crop[2:]):
             raise DeviceError(f"crop: expected u and v from 0 on and a width and a height, found {list(self.crop)}")
 

@@ -24,8 +24,6 @@ Image = NDArray[np.uint8]
 
 WAITING = 64  # images that wait to be taken; of a full queue the newest are lost, and missing in the numbers
 AGAIN_S = 1.0  # between tries to open a lost grabber
-SLICE_S = 0.05  # between looks whether it is lost
-CLOSING_S = 2.0  # a driver without a signal may keep the thread for ten
 
 
 class View(Protocol):
@@ -88,10 +86,11 @@ class VideoGrabber:
             If the grabber is lost, its images have changed their size, or the file has ended.
         """
         end = time.monotonic() + timeout_s
+        slice_s = 0.05  # between looks whether it is lost
         while True:
             fault = self._fault  # what was read before is given before it
             try:
-                return self._frames.get(timeout=max(min(end - time.monotonic(), SLICE_S), 0))
+                return self._frames.get(timeout=max(min(end - time.monotonic(), slice_s), 0))
             except queue.Empty:
                 if fault:
                     raise self._lost() from None
@@ -101,7 +100,8 @@ class VideoGrabber:
     def close(self) -> None:
         """Give the grabber back."""
         self._closing.set()
-        self._thread.join(CLOSING_S)
+        closing_s = 2.0  # a driver without a signal may keep the thread for ten
+        self._thread.join(closing_s)
 
     @property
     def _device(self) -> str:

@@ -12,7 +12,6 @@ from recon.errors import InputError, brief
 from recon.files.regular import read_bytes, shown
 
 MOST_BYTES = 1 << 24
-MOST_DEPTH = 64  # of lists and objects within each other
 MOST_DIGITS = 40  # of a whole number
 ODD_LETTER = re.compile(r"\\u(?:0000|[dD][89a-fA-F][0-9a-fA-F]{2})")  # a zero, or half of a pair of surrogates
 PAIR = re.compile(r"\\u[dD][89abAB][0-9a-fA-F]{2}\\u[dD][c-fC-F][0-9a-fA-F]{2}")
@@ -74,7 +73,8 @@ def _check_letters(path: Path, text: str) -> None:
 
 def _check_depth(path: Path, value: Any) -> None:
     layer: Sequence[Any] = [value]
-    for _ in range(MOST_DEPTH):
+    most_depth = 64  # of lists and objects within each other
+    for _ in range(most_depth):
         layer = [
             inner
             for outer in layer

@@ -21,24 +21,21 @@ from recon.files.regular import opened, read_bytes
 
 Buffer = bytes | memoryview
 
-BEGIN = b"MATLAB "  # of the header's text, in all versions from 5 on
-HDF5 = b"MATLAB 7.3"  # a file of another kind
 TAG = 8  # bytes, of an element's type and size
-HEADER = 128  # bytes, the order of bytes in the last two
 ORDERS = {b"IM": "<", b"MI": ">"}
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # by type of an element
 MATRIX, COMPRESSED = 14, 15  # types of elements
 NUMERIC = range(6, 16)  # classes of arrays
 OBJECTS = (3, 17)
 COMPLEX = 0x800  # in an array's flags
-MOST = 1 << 24  # bytes, of a matrix that is read
 HEAD = 1 << 12  # bytes within which an array's flags, shape and name stand
 
 
 def is_matlab(path: Path) -> bool:
     """Whether a file is one of MATLAB's, by its first bytes; raises InputError if it can't be read."""
+    begin = b"MATLAB "  # of the header's text, in all versions from 5 on
     with opened(path) as stream:
-        return stream.read(len(BEGIN)) == BEGIN
+        return stream.read(len(begin)) == begin
 
 
 def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) -> dict[str, NDArray]:
@@ -55,20 +52,23 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
         form.
     """
     data = read_bytes(path)
-    if data.startswith(HDF5):
+    hdf5 = b"MATLAB 7.3"  # a file of another kind
+    if data.startswith(hdf5):
         raise InputError(f"{path}: expected a MATLAB file of version 5 to 7, found 7.3: save it with -v7")
     arrays, objects = {}, False
+    header = 128  # bytes, the order of bytes in the last two
+    most = 1 << 24  # bytes, of a matrix that is read
     try:
-        order = ORDERS[data[HEADER - 2 : HEADER]]
-        for element in _elements(memoryview(data)[HEADER:], order):
+        order = ORDERS[data[header - 2 : header]]
+        for element in _elements(memoryview(data)[header:], order):
             size, head = _unpacked(*element, order, HEAD)
             kind, name = _described(head, order)
             objects |= kind in OBJECTS
             name = other_names.get(name, name)
             if name not in forms:
                 continue
-            if size > MOST:
-                raise InputError(f"{path}: {name}: expected a matrix of up to {MOST >> 20} MiB, found {-(-size >> 20)} MiB")
+            if size > most:
+                raise InputError(f"{path}: {name}: expected a matrix of up to {most >> 20} MiB, found {-(-size >> 20)} MiB")
             arrays[name] = _matrix(_unpacked(*element, order, size)[1], order)
     except InputError:
         raise

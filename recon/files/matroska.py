@@ -20,10 +20,7 @@ HOLDERS = {SEGMENT, INFO, TRACKS, CLUSTER, GROUP, ENTRY, PICTURE}
 SCALE, TIME, SIMPLE, BLOCK = 0x2AD7B1, 0xE7, 0xA3, 0xA1
 NUMBER, KIND, CODEC, NAME, COLOUR, WIDTH, HEIGHT, ENCODINGS = 0xD7, 0x83, 0x86, 0x536E, 0x2EB524, 0xB0, 0xBA, 0x6D80
 VIDEO, TEXTS = 1, (0x11, 0x21)  # kinds of tracks
-LACED = 0x06  # flags of a block with several frames
-USUAL_SCALE = 1_000_000  # ns
 MOST_TEXT = 1 << 20  # bytes of a field
-MOST_BLOCKS = 10_000_000
 
 
 @dataclass
@@ -70,7 +67,10 @@ def read(path: Path) -> Matroska:
         If the file is damaged or cut short, or its frames are packed or several in a block.
     """
     tracks, frames = list[Track](), dict[int, list[Frame]]()
-    scale, time, count = USUAL_SCALE, 0, 0
+    usual_scale = 1_000_000  # ns
+    scale, time, count = usual_scale, 0, 0
+    laced = 0x06  # flags of a block with several frames
+    most_blocks = 10_000_000
     with opened(path) as stream:
         end = stream.seek(0, 2)
         at = 0
@@ -95,9 +95,9 @@ def read(path: Path) -> Matroska:
             elif element in (SIMPLE, BLOCK):
                 track = _number(path, stream)
                 after, flags = int.from_bytes(stream.read(2), "big", signed=True), stream.read(1)
-                if track is None or not flags or stream.tell() > at or (count := count + 1) > MOST_BLOCKS:
+                if track is None or not flags or stream.tell() > at or (count := count + 1) > most_blocks:
                     raise _damaged(path, begin)
-                if flags[0] & LACED:
+                if flags[0] & laced:
                     raise InputError(f"{path}: expected a frame in each block, found several in one at byte {begin}")
                 frame = Frame((time + after) * scale, stream.tell(), at - stream.tell())
                 frames.setdefault(track, []).append(frame)

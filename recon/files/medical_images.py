@@ -39,13 +39,6 @@ NRRD_TYPES = {  # those of sequences, each with many names
     "double": "f8",
 }
 NO_PIXELS = ("MET_OTHER", "MET_NONE", "")  # types, in either format, of PLUS's files without images
-UNCOMPRESSED, GREY = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
-MOST_PX = 1 << 26  # of a video's images
-MOST_WHOLE = 1 << 40  # of any number of a header
-MOST_HEADER = 1 << 28  # bytes; a sequence of five hours has half as many
-LONGEST_LINE = 1 << 20  # bytes; a file of another kind may have no line breaks at all
-READ_AT_ONCE = 1 << 18  # bytes
-MOST_UNPACKED = 1100  # times the packed size: deflate reaches 1032
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,8 @@ def whole_numbers(path: Path, field: str, text: str, least: int = 0, pieces: int
         numbers = tuple(int(word) for word in text.split())
     except ValueError:
         numbers = ()
-    if not numbers or min(numbers) < least or max(numbers) > MOST_WHOLE or len(numbers) != (pieces or len(numbers)):
+    most_whole = 1 << 40  # of any number of a header
+    if not numbers or min(numbers) < least or max(numbers) > most_whole or len(numbers) != (pieces or len(numbers)):
         expected = "a whole number" if pieces == 1 else f"{pieces or ''} whole numbers".lstrip()
         raise fault(path, field, f"{expected} of at least {least}", repr(text))
     return numbers
@@ -211,11 +205,13 @@ def _nrrd(path: Path, stream: BinaryIO) -> ImageFile:
 
 
 def _line(path: Path, stream: BinaryIO) -> str:
-    line = stream.readline(LONGEST_LINE)
-    if stream.tell() > MOST_HEADER:
-        raise InputError(f"{path}: expected a header of up to {MOST_HEADER >> 20} MiB, found a longer one")
-    if len(line) == LONGEST_LINE:
-        raise InputError(f"{path}: expected a MetaImage or NRRD header, found a line of {LONGEST_LINE} bytes")
+    longest_line = 1 << 20  # bytes; a file of another kind may have no line breaks at all
+    line = stream.readline(longest_line)
+    most_header = 1 << 28  # bytes; a sequence of five hours has half as many
+    if stream.tell() > most_header:
+        raise InputError(f"{path}: expected a header of up to {most_header >> 20} MiB, found a longer one")
+    if len(line) == longest_line:
+        raise InputError(f"{path}: expected a MetaImage or NRRD header, found a line of {longest_line} bytes")
     return line.decode("utf-8", "surrogateescape")
 
 
@@ -239,7 +235,8 @@ def _check_length(file: ImageFile) -> None:
         said = file.fields.get("CompressedDataSize", "").split()
         if said and said[0].isdecimal() and there < int(said[0]):
             raise file.fault("pixels", f"{said[0]} packed bytes", f"{there}, the file has been cut short")
-    if file.data_bytes > there * (MOST_UNPACKED if file.packed else 1):
+    most_unpacked = 1100  # times the packed size: deflate reaches 1032
+    if file.data_bytes > there * (most_unpacked if file.packed else 1):
         raise file.fault("pixels", f"{file.data_bytes} bytes", f"{there}, the file has been cut short or damaged")
 
 
@@ -262,12 +259,14 @@ def _matroska(path: Path) -> ImageFile:
         raise fault(path, "tracks", "one of images", len(videos))
     track, frames = file.tracks[videos[0]], tuple(file.frames[videos[0]])
     width, height = track.number(matroska.WIDTH), track.number(matroska.HEIGHT)
-    coded = track.text(matroska.CODEC) != UNCOMPRESSED
+    uncompressed, grey = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
+    coded = track.text(matroska.CODEC) != uncompressed
     if coded:
         frames = tuple(sorted(frames))  # as they are shown, which may not be the order in which they are decoded
-    channels = 1 if track.text(matroska.COLOUR) == GREY and not coded else 3
+    channels = 1 if track.text(matroska.COLOUR) == grey and not coded else 3
     wrong = [frame.length for frame in frames if frame.length != width * height * channels]
-    if not 0 < width * height <= MOST_PX or (wrong and not coded):
+    most_px = 1 << 26  # of a video's images
+    if not 0 < width * height <= most_px or (wrong and not coded):
         raise fault(path, "frames", f"{width} x {height} pixels of {channels} bytes", f"{(wrong or [0])[0]} bytes")
     fields = {"Kinds": "domain domain list", "TrackName": track.text(matroska.NAME)}
     of_time: dict[int, list[int]] = {}
@@ -311,15 +310,16 @@ def _pieces(file: ImageFile) -> Iterator[bytes]:
                 yield stream.read(frame.length)
         return
     unpacker = zlib.decompressobj(wbits=47) if file.packed else None  # 47: a zlib or a gzip stream
+    read_at_once = 1 << 18  # bytes
     with opened(file.data_path) as stream:
         stream.seek(file.data_offset)
-        while raw := stream.read(READ_AT_ONCE):
+        while raw := stream.read(read_at_once):
             if unpacker is None:
                 yield raw
                 continue
             while raw and not unpacker.eof:
                 try:
-                    yield unpacker.decompress(raw, READ_AT_ONCE)
+                    yield unpacker.decompress(raw, read_at_once)
                 except zlib.error:
                     raise file.fault("pixels", "packed data", "damaged ones") from None
                 raw = unpacker.unconsumed_tail

@@ -1,14 +1,18 @@
-"""Mesh files: binary PLY in mm with normals and per-vertex sigma, and GLB in metres for viewers."""
+"""Mesh files: binary PLY in mm with normals and per-vertex sigma, and GLB in metres for viewers, of a mesh or of named layers."""
 
 import io
 import struct
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from PIL import Image
 from trimesh.visual import ColorVisuals
+from trimesh.visual.material import PBRMaterial
+from trimesh.visual.texture import TextureVisuals
 
 from recon.errors import InputError, reason
 from recon.files import atomic
@@ -16,8 +20,6 @@ from recon.files.regular import read_bytes
 
 # glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
-PLACED = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")  # of a vertex, for which meshes have their own places
-FARTHEST_MM = 1e7
 DAMAGE = (  # what trimesh raises on files damaged at random
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
     *(NotImplementedError, AssertionError, ZeroDivisionError, NameError, struct.error),
@@ -59,14 +61,17 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
         raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: expected {expected} of triangles, found none in it")
-    if not (np.abs(mesh.vertices) < FARTHEST_MM).all():
-        raise InputError(f"{path}: expected {expected} of finite places, below {FARTHEST_MM:g} mm, found others among them")
+    farthest_mm = 1e7
+    if not (np.abs(mesh.vertices) < farthest_mm).all():
+        raise InputError(f"{path}: expected {expected} of finite places, below {farthest_mm:g} mm, found others among them")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
         raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
     stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(stored, "dtype", None), "names", None) or ()
-    for name in (name for name in names if name not in PLACED):
+    # of a vertex, for which meshes have their own places
+    placed = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")
+    for name in (name for name in names if name not in placed):
         mesh.vertex_attributes[name] = np.asarray(stored[name], float).ravel()
     return mesh
 
@@ -108,3 +113,39 @@ def write_glb(path: Path, mesh: trimesh.Trimesh) -> None:
         set_greys(turned, greys)
     with atomic.new_file(path) as temporary:
         temporary.write_bytes(trimesh.exchange.gltf.export_glb(trimesh.Scene(turned), include_normals=True))
+
+
+def write_layers(path: Path, layers: Mapping[str, trimesh.Trimesh]) -> None:
+    """Write meshes in mm of the world as the named nodes of one file, turned as `meshes.write_glb` turns them."""
+    scene = trimesh.Scene()
+    for name, mesh in layers.items():
+        turned = mesh.copy()
+        turned.apply_transform(GLTF_FROM_WORLD)
+        if isinstance(mesh.visual, TextureVisuals) and isinstance(turned.visual, TextureVisuals):
+            for key, values in mesh.visual.vertex_attributes.items():  # which a copy leaves out
+                turned.visual.vertex_attributes[key] = values
+        scene.add_geometry(turned, node_name=name, geom_name=name)
+    with atomic.new_file(path) as temporary:
+        temporary.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+
+
+def painted(mesh: trimesh.Trimesh, colour: tuple[int, int, int, int], greys: NDArray[np.uint8] | None = None) -> trimesh.Trimesh:
+    """A mesh of one colour: red, green, blue and opacity, 0 to 255 each; both of its sides are seen.
+
+    greys : (n,)
+        Of the vertices, by which the colour is multiplied.
+    """
+    mode = "OPAQUE" if colour[3] == 255 else "BLEND"
+    material = PBRMaterial(baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True, alphaMode=mode)
+    visual = TextureVisuals(material=material)
+    if greys is not None:
+        visual.vertex_attributes["color"] = np.column_stack([greys, greys, greys, np.full_like(greys, 255)])
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, visual=visual)
+
+
+def pictured(corners: NDArray[np.float64], image: NDArray[np.uint8]) -> trimesh.Trimesh:
+    """A grey image : (h, w) on a quadrilateral : (4, 3) mm, from its upper left corner on clockwise."""
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], float)
+    material = PBRMaterial(baseColorTexture=Image.fromarray(image), metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True)
+    visual = TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False, visual=visual)

@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 MOST_BYTES = xml_text.MOST_BYTES
 Values = dict[str, Any]  # texts, numbers, lists and maps; a matrix is a map of rows, cols, dt and data
 
-SYMMETRIC = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
 DTYPES = {  # by OpenCV's letters
     **{"u": "u1", "c": "i1", "w": "u2", "s": "i2", "i": "i4", "f": "f4", "d": "f8", "h": "f2"},
     **{"b": "u1", "n": "u4", "I": "i8", "U": "u8"},  # of its version 5
@@ -256,8 +255,9 @@ def covariance(path: Path, values: Values, count: int) -> Array:
         raise InputError(f"{expected} values that are not finite")
     sigma = np.sqrt(np.abs(np.diag(found)))
     scale = np.outer(sigma, sigma) + np.finfo(float).tiny
-    if (np.abs(found - found.T) > SYMMETRIC * scale).any():
+    symmetric = 1e-9  # of a covariance, relative to the standard deviations: it comes from a text file
+    if (np.abs(found - found.T) > symmetric * scale).any():
         raise InputError(f"{expected} a matrix that is not symmetric")
-    if np.diag(found).min() < 0 or (np.abs(found) > (1 + SYMMETRIC) * scale).any():
+    if np.diag(found).min() < 0 or (np.abs(found) > (1 + symmetric) * scale).any():
         raise InputError(f"{expected} a variance below zero or a correlation beyond one")
     return (found + found.T) / 2

@@ -13,7 +13,6 @@ from typing import NamedTuple
 from recon.errors import InputError, reason
 from recon.files.regular import opened
 
-MOST_BYTES = 1 << 28  # of a member; a full frame's PNG has a few MB
 DAMAGE = (tarfile.TarError, EOFError, ValueError, OverflowError, RecursionError)  # what the headers of damaged files end in
 
 
@@ -37,6 +36,7 @@ def members(path: Path) -> Iterator[Member]:
         If there is no such file, it isn't a regular one, or it is damaged, cut short, or has a file with holes or one that is
         too large.
     """
+    most_bytes = 1 << 28  # of a member; a full frame's PNG has a few MB
     try:
         with opened(path, expected="a tar file") as stream, tarfile.open(fileobj=stream, mode="r:") as archive:
             end, last = os.fstat(stream.fileno()).st_size, -1
@@ -46,9 +46,9 @@ def members(path: Path) -> Iterator[Member]:
                 last = entry.offset
                 if not entry.isfile() or entry.name.rpartition("/")[2].startswith("."):
                     continue
-                if entry.issparse() or not 0 <= entry.size <= MOST_BYTES:
+                if entry.issparse() or not 0 <= entry.size <= most_bytes:
                     found = "one with holes" if entry.issparse() else f"{entry.size}"
-                    raise InputError(f"{path}: {entry.name!r}: expected a file of up to {MOST_BYTES} bytes, found {found}")
+                    raise InputError(f"{path}: {entry.name!r}: expected a file of up to {most_bytes} bytes, found {found}")
                 if entry.offset_data + entry.size > end:
                     raise InputError(f"{path}: {entry.name!r}: expected {entry.size} bytes, found the tar file cut short")
                 yield Member(entry.name, entry.offset_data, entry.size)

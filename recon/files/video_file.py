@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 
-LOUDNESS, SILENT = "OPENCV_FFMPEG_LOGLEVEL", "-8"  # of a damaged video we say so ourselves, in one line
 OPTIONS, PROTOCOLS = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist"
 
 
@@ -17,7 +16,8 @@ def opened(path: Path) -> cv2.VideoCapture:
     given = [option for option in os.environ.get(OPTIONS, "").split("|") if option]
     if not any(option.split(";")[0].strip() == PROTOCOLS for option in given):
         given.append(f"{PROTOCOLS};file")  # a file may name others, far away
-    with _environment({LOUDNESS: os.environ.get(LOUDNESS, SILENT), OPTIONS: "|".join(given)}):
+    loudness, silent = "OPENCV_FFMPEG_LOGLEVEL", "-8"  # of a damaged video we say so ourselves, in one line
+    with _environment({loudness: os.environ.get(loudness, silent), OPTIONS: "|".join(given)}):
         return cv2.VideoCapture(str(path), backend)
 
 

@@ -25,8 +25,6 @@ from recon.files.regular import read_bytes
 Array = NDArray[np.float64]
 
 MOST_BYTES = 1 << 33  # of all voxels, and of a file of them
-LARGEST_VOXEL = 8  # bytes
-FARTHEST_MM = 1e9
 META_NAMES = {np.dtype(code): name for name, code in medical_images.META_TYPES.items()}
 NRRD_NAMES = {dtype: {"f4": "float", "f8": "double"}.get(dtype.str[1:], dtype.name) for dtype in META_NAMES}
 DAMAGE = (  # what pynrrd raises on headers and pixels damaged at random: it parses without checking
@@ -135,9 +133,10 @@ def _nrrd_content(path: Path) -> tuple[NDArray, nrrd.NRRDHeader]:
     if detached is not None:
         medical_images.check_beside(path, path.parent / detached)
         stream = io.BytesIO(read_bytes(path.parent / detached, MOST_BYTES))
-    most = LARGEST_VOXEL * math.prod(map(int, header["sizes"])) + 1
+    largest_voxel = 8  # bytes
+    most = largest_voxel * math.prod(map(int, header["sizes"])) + 1
     if not 1 < most <= MOST_BYTES:
-        raise fault(path, "sizes", f"numbers of voxels, up to {MOST_BYTES // LARGEST_VOXEL} in all", header["sizes"])
+        raise fault(path, "sizes", f"numbers of voxels, up to {MOST_BYTES // largest_voxel} in all", header["sizes"])
     lines = header.pop("line skip", header.pop("lineskip", 0))
     for _ in range(lines):
         if not stream.readline():
@@ -180,10 +179,11 @@ def _read_metaimage(path: Path) -> Volume:
 
 
 def _check_grid(path: Path, volume: Volume) -> None:
-    if np.shape(volume.origin) != (3,) or not (np.abs(volume.origin) < FARTHEST_MM).all():
-        raise fault(path, "origin", "3 finite numbers", f"{volume.origin}, beyond {FARTHEST_MM:g} mm or none")
-    if np.shape(volume.spacing) != (3,) or not ((volume.spacing > 0) & (volume.spacing < FARTHEST_MM)).all():
-        raise fault(path, "spacing", "3 lengths above 0", f"{volume.spacing}, beyond {FARTHEST_MM:g} mm or none")
+    farthest_mm = 1e9
+    if np.shape(volume.origin) != (3,) or not (np.abs(volume.origin) < farthest_mm).all():
+        raise fault(path, "origin", "3 finite numbers", f"{volume.origin}, beyond {farthest_mm:g} mm or none")
+    if np.shape(volume.spacing) != (3,) or not ((volume.spacing > 0) & (volume.spacing < farthest_mm)).all():
+        raise fault(path, "spacing", "3 lengths above 0", f"{volume.spacing}, beyond {farthest_mm:g} mm or none")
     if np.shape(volume.directions) != (3, 3) or not (np.abs(volume.directions) < 2).all():
         raise fault(path, "directions", "3 unit vectors", np.ravel(volume.directions))
     if abs(abs(np.linalg.det(volume.directions)) - 1) > 1e-3:

@@ -24,7 +24,6 @@ log = logging.getLogger(__name__)
 LIST = ".sonotwin.json"
 SCHEMA = "sonotwin-written/1"
 UNPLACED = ".sonotwin.unplaced"  # in the last of several new folders, until all are in place
-REPLACED = "replaced"  # instead of a writer: a file of another's whose content was taken over
 ELSEWHERE = "move it away, or give another place"  # the way on
 
 
@@ -48,7 +47,6 @@ class Addition:
 
 Files = dict[str, tuple[Written, ...]]  # by path within the folder; two of a file that is being replaced where it stands
 _known: dict[tuple[int, ...], str] = {}  # digests by device, inode, size and times: files are read once a process
-RESTED_NS = 2_000_000_000  # after which a file's times tell one change from the next
 
 
 def read_list(folder: Path) -> Files | None:
@@ -120,7 +118,8 @@ def _sha256(path: Path) -> str:
         if key in _known:
             return _known[key]
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    if abs(time.time_ns() - max(there.st_mtime_ns, there.st_ctime_ns)) > RESTED_NS:
+    rested_ns = 2_000_000_000  # after which a file's times tell one change from the next
+    if abs(time.time_ns() - max(there.st_mtime_ns, there.st_ctime_ns)) > rested_ns:
         _known[key] = digest
     return digest
 
@@ -225,6 +224,7 @@ def complete(new: Path, old: Path, by: str, shared: Collection[str] = ()) -> Non
     for path in new.rglob(LIST):  # of folders that were made within this one, and are its own
         path.unlink()
     made = entries(new)
+    replaced = "replaced"  # instead of a writer: a file of another's whose content was taken over
     for name in sorted(made):
         here, earlier = new / name, old / name
         if blocking := next((parent for parent in _above(name) if parent in there), None):
@@ -237,7 +237,7 @@ def complete(new: Path, old: Path, by: str, shared: Collection[str] = ()) -> Non
         if name in there and _same(here, earlier):
             files |= {name: listed} if listed else {}
         elif name in shared and earlier.is_file() and not own:
-            files[name] = written(here, by), written(earlier, REPLACED)
+            files[name] = written(here, by), written(earlier, replaced)
         elif name in there and not own and _alike(here, earlier):
             if not unchanged:  # what is listed may be a copy, where there are no links
                 here.unlink()

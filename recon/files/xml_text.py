@@ -9,7 +9,6 @@ from recon.errors import InputError
 from recon.files.regular import read_bytes, shown
 
 MOST_BYTES = 1 << 24
-MOST_DEPTH = 64  # of elements within each other
 DECLARED = re.compile(rb"<\?xml[^>]*?\bencoding\s*=\s*[\"']([A-Za-z][A-Za-z0-9._-]{0,40})[\"']")
 MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
@@ -44,7 +43,8 @@ def parsed(path: Path, data: bytes) -> Element:
     except (ParseError, ValueError) as error:
         raise InputError(f"{shown(path)}: expected XML, found it broken: {error}") from None
     layer = [root]
-    for _ in range(MOST_DEPTH):
+    most_depth = 64  # of elements within each other
+    for _ in range(most_depth):
         layer = [inner for outer in layer for inner in outer]
         if not layer:
             return root

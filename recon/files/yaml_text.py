@@ -17,7 +17,6 @@ from recon.files.regular import read_text, shown
 
 MOST_BYTES = 1 << 22
 MOST_VALUES = 100_000  # with those for which aliases stand
-MOST_DEPTH = 64  # of lists and maps within each other
 MOST_DIGITS = 40  # of a whole number
 PLAIN = ("null", "bool", "int", "float", "str", "seq", "map", "merge")
 FAULTS = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, RecursionError)  # of tags that don't fit, too
@@ -26,7 +25,7 @@ PREFIX = "tag:yaml.org,2002:"
 Base: type[yaml.SafeLoader] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class PlainLoader(Base):
+class _PlainLoader(Base):
     """Loader of null, true and false, numbers, texts, lists and maps: a date is a text, and keys of a map are different."""
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
@@ -48,16 +47,16 @@ class PlainLoader(Base):
         return super().construct_mapping(node, deep)
 
 
-PlainLoader.yaml_implicit_resolvers = {
+_PlainLoader.yaml_implicit_resolvers = {
     letter: [(tag, pattern) for tag, pattern in rules if tag.removeprefix(PREFIX) in PLAIN]
     for letter, rules in Base.yaml_implicit_resolvers.items()
 }
-PlainLoader.yaml_constructors = {
+_PlainLoader.yaml_constructors = {
     tag: make
     for tag, make in Base.yaml_constructors.items()
     if tag is None or tag.removeprefix(PREFIX) in PLAIN  # all others are refused by that of None
 }
-PlainLoader.add_constructor(f"{PREFIX}int", PlainLoader.construct_yaml_int)
+_PlainLoader.add_constructor(f"{PREFIX}int", _PlainLoader.construct_yaml_int)
 
 
 def read(path: Path, expected: str = "a file") -> Any:
@@ -76,7 +75,7 @@ def loaded(path: Path, text: str) -> Any:
     """Values of a YAML text that stood in a file; raises InputError as `read` does."""
     deque(events(path, text, MOST_VALUES), maxlen=0)
     try:
-        return yaml.load(text, Loader=PlainLoader)
+        return yaml.load(text, Loader=_PlainLoader)
     except FAULTS as error:
         raise _fault(path, error) from None
 
@@ -89,6 +88,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
     sizes: dict[str, int | None] = {}  # values below an anchor; None while it is open
     open_ones: list[tuple[str | None, int]] = []  # anchor, and values before it
     values = 0
+    most_depth = 64  # of lists and maps within each other
     for event in _parsed(path, text):
         if isinstance(event, AliasEvent):
             size = sizes.get(event.anchor, 0)
@@ -113,7 +113,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
                 sizes[anchor] = values - before
         elif isinstance(event, DocumentStartEvent):
             sizes.clear()
-        if len(open_ones) > MOST_DEPTH:
+        if len(open_ones) > most_depth:
             raise InputError(f"{shown(path)}: expected YAML, found values nested too deeply")
         if values > most:
             raise InputError(f"{shown(path)}: expected YAML of up to {most} values, found more, written out or as aliases")
@@ -122,7 +122,7 @@ def events(path: Path, text: str, most: int) -> Iterator[yaml.Event]:
 
 def _parsed(path: Path, text: str) -> Iterator[yaml.Event]:
     try:
-        yield from yaml.parse(text, Loader=PlainLoader)
+        yield from yaml.parse(text, Loader=_PlainLoader)
     except FAULTS as error:
         raise _fault(path, error) from None
 

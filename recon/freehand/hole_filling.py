@@ -18,7 +18,6 @@ STICKS = np.array(  # x, y, z; one of each pair of opposite directions to the 26
     np.int64,
 )
 MOST_VOXELS = 9  # of a stick, both ends included
-MOSTLY = 90  # percentile of the gaps between B-scans that are to be filled
 
 
 def fill_holes(
@@ -62,7 +61,8 @@ def spacing_that_fills(world_from_pixel: Array, corners: Array, most_voxels: int
     normals = np.cross(placed[:-1, :3, 0], placed[:-1, :3, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     gaps = np.abs(np.einsum("nik,ni->nk", steps, normals)).max(axis=1)
-    widest = max(float(np.percentile(gaps, MOSTLY)), float(np.linalg.norm(placed[0, :3, :2], axis=0).max()))
+    mostly = 90  # percentile of the gaps between B-scans that are to be filled
+    widest = max(float(np.percentile(gaps, mostly)), float(np.linalg.norm(placed[0, :3, :2], axis=0).max()))
     return widest / max(most_voxels - 1, 1)
 
 

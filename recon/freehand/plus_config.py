@@ -25,7 +25,6 @@ COMPOUNDING: dict[str, Compounding] = {"MEAN": "mean", "MAXIMUM": "maximum", "LA
 INTERPOLATION: dict[str, Interpolation] = {"NEAREST_NEIGHBOR": "nearest", "LINEAR": "linear"}
 ARITHMETIC: dict[str, Arithmetic] = {"FULL": "plus_full", "PARTIAL": "plus_partial", "NONE": "plus_none"}
 EARLIER = {"WEIGHTED_AVERAGE": "MEAN", "MAXIMUM": "MAXIMUM"}
-FAN_RADIUS_STOP = 500.0  # px, as PLUS has it where none is given
 SWITCH = {"ON": True, "TRUE": True, "OFF": False, "FALSE": False}
 
 
@@ -96,7 +95,8 @@ def _fan(path: Path, element: Element) -> Fan | None:
         return None
     u, v = _numbers(path, element, ("FanOriginPixel", "FanOrigin"), [0, 0])
     (first,) = _numbers(path, element, ("FanRadiusStartPixel",), [0])
-    (last,) = _numbers(path, element, ("FanRadiusStopPixel", "FanDepth"), [FAN_RADIUS_STOP])
+    fan_radius_stop = 500.0  # px, as PLUS has it where none is given
+    (last,) = _numbers(path, element, ("FanRadiusStopPixel", "FanDepth"), [fan_radius_stop])
     try:
         return Fan(u, v, first, last, left, right)
     except ValueError as error:

@@ -56,8 +56,6 @@ class Unsure(NamedTuple):
 
 
 ASSUMED = Unsure(0.1, 50.0)  # of a lag that is taken as none: scanners show images 0 to 200 ms late; and of any tissue's sound
-SOFT_M_S = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
-KNOWN_TISSUE_M_S = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
 
 
 class TissueFields(Part):
@@ -114,7 +112,8 @@ class ScansFields(TissueFields, SequenceFields):
     def unsure(self) -> Unsure:
         """Standard deviations, wider of what isn't given but assumed."""
         lag = self.lag_sigma_s if self.lag_sigma_s is not None else ASSUMED.lag_s if self._lag_assumed else 0.0
-        known = ASSUMED.tissue_m_s if self.tissue_m_s is None else KNOWN_TISSUE_M_S
+        known_tissue_m_s = 25.0  # m/s, standard deviation of the speed of sound in tissue that is known by its kind
+        known = ASSUMED.tissue_m_s if self.tissue_m_s is None else known_tissue_m_s
         return Unsure(lag, known if self.tissue_sigma_m_s is None else self.tissue_sigma_m_s)
 
     @property
@@ -335,13 +334,14 @@ def cautions(scans: Scans) -> Iterator[str]:
         yield line
     if scans.elsewhere:
         yield "3D Slicer shows the sequence where its transforms to RAS put it, and these results elsewhere: give reference=LPS"
-    if not SOFT_M_S[0] <= scans.speed_m_s <= SOFT_M_S[1]:
+    soft_m_s = (900.0, 1800.0)  # of soft tissues, water, silicone and gels
+    if not soft_m_s[0] <= scans.speed_m_s <= soft_m_s[1]:
         found = f"sound of {scans.speed_m_s:g} m/s in all that was scanned"
-        yield f"{found}: of bone or gas? Soft tissues, water and silicone have {SOFT_M_S[0]:g} to {SOFT_M_S[1]:g} m/s"
+        yield f"{found}: of bone or gas? Soft tissues, water and silicone have {soft_m_s[0]:g} to {soft_m_s[1]:g} m/s"
     yield from scan_checks.faults(scans.stream(), scans.world_from_pixel)
 
 
-def pixel_sides(scans: Scans) -> Array:
+def _pixel_sides(scans: Scans) -> Array:
     """Width and height : (2,) mm of a pixel, in the median; NaN without a pose."""
     placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
     return np.median(np.linalg.norm(placed[:, :3, :2], axis=1), axis=0) if len(placed) else np.full(2, np.nan)
@@ -350,10 +350,10 @@ def pixel_sides(scans: Scans) -> Array:
 def sides(scans: Scans, clip: Clip | None = None) -> list[float]:
     """Width and height of the B-scans, or of their part within a clip, mm."""
     left, right, top, bottom = (clip or Clip(0, 0, scans.shape[1], scans.shape[0])).bounds(scans.shape)
-    return (pixel_sides(scans) * [right - left + 1, bottom - top + 1]).tolist()
+    return (_pixel_sides(scans) * [right - left + 1, bottom - top + 1]).tolist()
 
 
-def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
+def _size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
     """Faults of the size of the B-scans, or of their part within a clip, and of their axes; none as a rule."""
     placed = scans.world_from_pixel[np.isfinite(scans.world_from_pixel).all(axis=(1, 2))]
     if not len(placed):
@@ -361,7 +361,7 @@ def size_faults(scans: Scans, clip: Clip | None = None) -> list[str]:
     faults = []
     wrong = [fault for side in sides(scans, clip) if (fault := lengths.B_SCAN.fault(side))]
     if wrong:
-        same = np.abs(pixel_sides(scans) - 1).max() < 1e-6
+        same = np.abs(_pixel_sides(scans) - 1).max() < 1e-6
         cause = ", pixels of 1 mm: the identity in place of the probe's calibration?" if same else ""
         faults.append(f"sides of {lengths.B_SCAN}, found {wrong[0]}{cause}")
     if found := lengths.axes_fault(placed[0]):
@@ -377,7 +377,7 @@ def check_size(scans: Scans, place: str, clip: Clip | None, implausible: Implaus
     InputError
         If they are, and not to be taken.
     """
-    for fault in size_faults(scans, clip):
+    for fault in _size_faults(scans, clip):
         refuse_or_warn(place, f"B-scans: expected {fault}", implausible)
     if doubt := next(filter(None, map(lengths.B_SCAN.doubt, sides(scans, clip))), None):
         log.warning("%s: a side of the B-scans is %s", place, doubt)

@@ -17,7 +17,6 @@ from recon.files.medical_images import ImageFile
 
 TURNS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # steps along v and u that turn one into MF
 ORIENTATIONS = (*TURNS, *(name[::-1] for name in TURNS))  # those with lines of sound in rows are transposed before
-COLOUR_KINDS = ("vector", "rgb-color", "rgba-color", "3-color", "4-color")  # of an NRRD axis
 LUMINANCE = np.array([299, 587, 114])  # of red, green and blue, per mille: Rec. ITU-R BT.601
 DEPTHS = (8, 10, 12, 14, 16)  # bits of scanners' grey levels
 
@@ -43,7 +42,8 @@ def layout(file: ImageFile) -> Layout:
     if len(kinds) != len(file.size):
         raise file.fault("Kinds", f"{len(file.size)} words", repr(" ".join(kinds)))
     lengths = list(zip(file.size, (kind.lower() for kind in kinds), strict=True))
-    colours = [length for length, kind in lengths[:1] if kind in COLOUR_KINDS]
+    colour_kinds = ("vector", "rgb-color", "rgba-color", "3-color", "4-color")  # of an NRRD axis
+    colours = [length for length, kind in lengths[:1] if kind in colour_kinds]
     space = [length for length, kind in lengths if kind in ("domain", "space")]
     time = [length for length, kind in lengths if kind in ("list", "time")]
     strange = len(colours) + len(space) + len(time) < len(lengths)

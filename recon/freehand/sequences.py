@@ -55,14 +55,11 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
     ),
     *("data file", "datafile", "ultrasound image orientation", "ultrasound image type"),
 }
-MOST_EMPTY, FEW_FRAMES = 10, 10_000  # times the fields that are there, which all frames may lack; frames of a file without any
 FARTHEST_MM, MOST_SECONDS = 1e7, 9e9  # of a matrix; of a time stamp, that nanoseconds of 64 bits can hold
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
 RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
 SHOWN = "Physical"  # where 3D Slicer shows the images, its RAS
-TRACK_NAME = "TrackName"  # field of the file that names the frame of the images shown there
-SAME = 1e-6  # of the entries of matrices
 
 
 class FrameNames(NamedTuple):
@@ -120,7 +117,8 @@ def sequence_of(images: ArrayLike, world_from_target: Array, probe: ProbeCalibra
         f"ImageTo{SHOWN}": np.where(found[:, None, None], shown, np.eye(4)),
     }
     valid = dict.fromkeys([*transforms, "Image"], always) | {"ProbeToTracker": found, f"ImageTo{SHOWN}": found}
-    frames = Frames(times, transforms, valid, images, fields={TRACK_NAME: "Image"})
+    track_name = "TrackName"  # field of the file that names the frame of the images shown there
+    frames = Frames(times, transforms, valid, images, fields={track_name: "Image"})
     _check(Path("sequence"), frames)
     return frames
 
@@ -190,7 +188,8 @@ def lies_elsewhere(frames: Frames, reference: str) -> bool:
     except InputError:
         return False
     placed = lps_from_reference[np.isfinite(lps_from_reference).all(axis=(1, 2))]
-    return bool(np.abs(placed - np.eye(4)).max(initial=0) > SAME)
+    same = 1e-6  # of the entries of matrices
+    return bool(np.abs(placed - np.eye(4)).max(initial=0) > same)
 
 
 def read_sequence(path: Path) -> Frames:
@@ -276,7 +275,9 @@ def _without_images(file: ImageFile) -> Frames:
 def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
     table: dict[str, list[str]] = {}
     names = {match[2] for name in file.fields if (match := FRAME_FIELD.fullmatch(name))}
-    if (len(names) + 1) * count > MOST_EMPTY * (len(file.fields) + FEW_FRAMES):
+    # times the fields that are there, which all frames may lack; frames of a file without any
+    most_empty, few_frames = 10, 10_000
+    if (len(names) + 1) * count > most_empty * (len(file.fields) + few_frames):
         raise file.fault("DimSize", f"frames of which most have fields, as {len(file.fields)} are there", f"{count} frames")
     for name, text in file.fields.items():
         if match := FRAME_FIELD.fullmatch(name):

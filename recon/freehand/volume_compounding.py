@@ -29,7 +29,6 @@ Length = Annotated[int, Field(gt=0)]
 Rectangle = tuple[int, int, Length, Length]  # u, v, width, height of a clip, px; of a setting
 
 RULES = {"mean": MEAN, "maximum": MAXIMUM, "latest": LATEST, "weighted": WEIGHTED}
-BYTES_PER_VOXEL = 10  # sum and weight in float32; the grey value, and whether it is filled
 MOST_BYTES = 4 << 30
 
 
@@ -202,8 +201,9 @@ def reconstruct(
         raise InputError(f"weights: expected with the weighted compounding, and only then, found {found}")
     own = np.empty((0, 0), np.uint8) if weights is None else np.ascontiguousarray(weights)
     shape = grid.size[::-1]
-    if np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL > most_bytes:
-        needed = np.prod(grid.size, dtype=float) * BYTES_PER_VOXEL / 2**30
+    bytes_per_voxel = 10  # sum and weight in float32; the grey value, and whether it is filled
+    if np.prod(grid.size, dtype=float) * bytes_per_voxel > most_bytes:
+        needed = np.prod(grid.size, dtype=float) * bytes_per_voxel / 2**30
         found = f"{needed:.1f} GiB for {' x '.join(map(str, grid.size))} voxels; take a larger spacing or clip"
         raise InputError(f"volume: expected at most {most_bytes / 2**30:.1f} GiB, found {found}")
     as_plus = arithmetic != "floating"

@@ -8,7 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.files import meshes
-from recon.files.layers import painted, pictured
+from recon.files.meshes import painted, pictured
 from recon.freehand.scans import Scans
 from recon.fusion import probe_shape
 from recon.geometry import rigid
@@ -22,8 +22,6 @@ SKIN, TABLE, MASS = (224, 187, 165, 150), (120, 105, 90, 255), (200, 60, 60, 255
 PATH, DEVICE, BODY, INK = (60, 140, 220, 255), (90, 90, 90, 255), (235, 235, 235, 255), (20, 20, 20, 255)
 GREY_SKIN, GREY_TABLE = (255, 240, 230, 170), (255, 255, 255, 255)  # over which the surface's own grey is laid
 STEP_MM = 1.0  # of the surfaces' vertices, which are merged to that
-PATH_MM = 0.6  # radius of the path's tube
-DEVICE_MM = 40.0  # length of a device's pyramid
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +47,7 @@ class FusedScene:
     def path(self) -> Array:
         """Middles of the array's face : (m, 3) mm, of the B-scans with a pose."""
         placed = np.isfinite(self.scans.world_from_pixel).all(axis=(1, 2))
-        return faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
+        return _faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
 
 
 def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
@@ -82,10 +80,10 @@ def surface_layer(
 
 def scan_layer(image: NDArray[np.uint8], world_from_pixel: Array) -> trimesh.Trimesh:
     """A B-scan : (h, w) where it was taken, to the borders of its outer pixels."""
-    return pictured(scan_corners(image.shape[1], image.shape[0], world_from_pixel), image)
+    return pictured(_scan_corners(image.shape[1], image.shape[0], world_from_pixel), image)
 
 
-def scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
+def _scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
     """Outer corners : (4, 3) mm of a B-scan, from the upper left one on clockwise."""
     u, v = np.array([-0.5, width - 0.5, width - 0.5, -0.5]), np.array([-0.5, -0.5, height - 0.5, height - 0.5])
     return rigid.apply(world_from_pixel, np.column_stack([u, v, np.zeros(4)]))
@@ -95,7 +93,8 @@ def path_layer(places: Array) -> trimesh.Trimesh:
     """A tube along places : (n, 3) mm, n >= 2; where two coincide there is no piece."""
     moved = np.linalg.norm(np.diff(places, axis=0), axis=1) > 1e-6
     ends = zip(places[:-1][moved], places[1:][moved], strict=True)
-    pieces = [trimesh.creation.cylinder(PATH_MM, segment=both, sections=6) for both in ends]
+    path_mm = 0.6  # radius of the path's tube
+    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends]
     whole = trimesh.util.concatenate(pieces)
     assert isinstance(whole, trimesh.Trimesh)
     return painted(whole, PATH)
@@ -105,7 +104,8 @@ def device_layer(camera: Camera) -> trimesh.Trimesh:
     """A camera or the projector as a pyramid: its centre, and its view some centimetres away."""
     width, height = camera.size
     corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
-    vertices = np.vstack([camera.centre, camera.centre + DEVICE_MM * camera.rays(corners)])
+    device_mm = 40.0  # length of a device's pyramid
+    vertices = np.vstack([camera.centre, camera.centre + device_mm * camera.rays(corners)])
     faces = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]]
     return painted(trimesh.Trimesh(vertices, faces, process=False), DEVICE)
 
@@ -140,6 +140,6 @@ def evenly(numbers: list[int], count: int) -> list[int]:
     )
 
 
-def faces_middle(world_from_pixel: Array, width: int) -> Array:
+def _faces_middle(world_from_pixel: Array, width: int) -> Array:
     """Middles of the array's face : (n, 3) mm, from matrices : (n, 4, 4) of B-scans as wide as some px."""
     return world_from_pixel[:, :3, 0] * (width - 1) / 2 + world_from_pixel[:, :3, 3]

@@ -13,8 +13,6 @@ from recon.model.rig import Target
 Array = NDArray[np.float64]
 
 BOARD_MM, INK_MM = 3.0, 0.2  # thickness of the board, and of the circles on it
-HOUSING_MM = (6.0, 45.0, 20.0)  # wider than the array, long and thick
-STRUT_MM = 4.0  # radius of the bracket
 
 
 def of(target: Target, probe: ProbeCalibration, width: int) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
@@ -23,10 +21,12 @@ def of(target: Target, probe: ProbeCalibration, width: int) -> tuple[trimesh.Tri
     middle = circle_layout.middle(target) - [0, 0, BOARD_MM / 2]
     board = trimesh.creation.box([x, y, BOARD_MM], rigid.transform(np.eye(3), middle))
     array = (width - 1) * probe.scale[0]
-    wider, length, thick = HOUSING_MM
+    housing_mm = (6.0, 45.0, 20.0)  # wider than the array, long and thick
+    wider, length, thick = housing_mm
     held = probe.target_from_image @ rigid.transform(np.eye(3), np.array([array / 2, -length / 2, 0.0]))
     housing = trimesh.creation.box([array + wider, length, thick], held)
-    strut = trimesh.creation.cylinder(STRUT_MM, segment=[middle, held[:3, 3]], sections=16)
+    strut_mm = 4.0  # radius of the bracket
+    strut = trimesh.creation.cylinder(strut_mm, segment=[middle, held[:3, 3]], sections=16)
     body = trimesh.util.concatenate([board, housing, strut])
     rings = trimesh.util.concatenate([_ring(target, centre) for centre in circle_centres(target)])
     assert isinstance(body, trimesh.Trimesh) and isinstance(rings, trimesh.Trimesh)

@@ -25,7 +25,6 @@ STEP_MM = 1.5  # of the surfaces' vertices in the view
 SLIDES = 60  # B-scans that the slider passes
 FOOTER = "Measured in the frame of camera 1; nothing is registered."
 UNKNOWN = "unknown"
-RAY_MM = 60.0  # of a device, towards the corners of its view
 
 
 def write(path: Path, scene: FusedScene, title: str) -> None:
@@ -85,10 +84,11 @@ def wires(scene: FusedScene) -> Iterator[Lines]:
     """The path of the array's face, and the devices' views."""
     if len(scene.path) > 1:
         yield Lines("path", scene.path[None], PATH)
+    ray_mm = 60.0  # of a device, towards the corners of its view
     for name, camera in scene.devices.items():
         width, height = camera.size
         corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], float)
-        ends = camera.centre + RAY_MM * camera.rays(corners)
+        ends = camera.centre + ray_mm * camera.rays(corners)
         round_ = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
         edges = np.stack([np.broadcast_to(camera.centre, ends.shape), ends], axis=1)
         yield Lines(name, np.concatenate([edges, round_]), DEVICE, shown=False)  # far away

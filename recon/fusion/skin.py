@@ -20,12 +20,7 @@ from recon.geometry.primitives import Plane, fit_plane
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SAMPLE = 20_000  # points that the plane is sought with
 TRIALS = 2000  # triples of them; a plane of 0.15 of the points is missed with a chance of 0.001
-NEAR_MM = 1.0  # of the plane: a point on it
-LEAST_ON = 0.15  # of the points, on a plane that things stand on
-MOST_BEHIND = 0.03  # of the points, behind it
-LEAST_BEFORE = 0.02  # of the points, before it: else there is nothing but the plane
 STANDS_MM = 2.0  # before the plane: not the plane any more
 
 
@@ -46,20 +41,21 @@ def by_mask(surface: trimesh.Trimesh, mask: Mask, camera: Camera) -> Parted:
 
 def by_plane(surface: trimesh.Trimesh, seed: int = 0) -> Parted:
     """Part by the plane that things stand on; all of the surface is skin where there is none."""
-    plane = standing_plane(np.asarray(surface.vertices, float), seed)
+    plane = _standing_plane(np.asarray(surface.vertices, float), seed)
     if plane is None:
         return Parted(surface, None)
     before = plane.distance(np.asarray(surface.vertices, float)) > STANDS_MM
     return _parted(surface, _largest_piece(surface, before))
 
 
-def standing_plane(points: Array, seed: int = 0) -> Plane | None:
+def _standing_plane(points: Array, seed: int = 0) -> Plane | None:
     """The plane that things stand on, its normal towards the camera at the origin; None where there is none.
 
     points : (n, 3) mm
     """
     rng = np.random.default_rng(seed)
-    some = points[rng.choice(len(points), min(SAMPLE, len(points)), replace=False)]
+    sample = 20_000  # points that the plane is sought with
+    some = points[rng.choice(len(points), min(sample, len(points)), replace=False)]
     a, b, c = some[rng.integers(len(some), size=(3, TRIALS))]
     normals = np.cross(b - a, c - a)
     length = np.linalg.norm(normals, axis=1)
@@ -67,15 +63,19 @@ def standing_plane(points: Array, seed: int = 0) -> Plane | None:
     offsets = (normals * a[length > 0]).sum(axis=1)
     if not len(normals):
         return None
-    on = [np.count_nonzero(np.abs(some @ normal - offset) < NEAR_MM) for normal, offset in zip(normals, offsets, strict=True)]
+    near_mm = 1.0  # of the plane: a point on it
+    on = [np.count_nonzero(np.abs(some @ normal - offset) < near_mm) for normal, offset in zip(normals, offsets, strict=True)]
     best = int(np.argmax(on))
-    near = some[np.abs(some @ normals[best] - offsets[best]) < NEAR_MM]
-    if len(near) < max(4, LEAST_ON * len(some)):
+    near = some[np.abs(some @ normals[best] - offsets[best]) < near_mm]
+    least_on = 0.15  # of the points, on a plane that things stand on
+    if len(near) < max(4, least_on * len(some)):
         return None
     plane = fit_plane(near).shape
     away = plane.distance(some)
     behind, before = np.mean(away < -STANDS_MM), np.mean(away > STANDS_MM)
-    return plane if behind < MOST_BEHIND and before > LEAST_BEFORE else None
+    most_behind = 0.03  # of the points, behind it
+    least_before = 0.02  # of the points, before it: else there is nothing but the plane
+    return plane if behind < most_behind and before > least_before else None
 
 
 def _largest_piece(surface: trimesh.Trimesh, chosen: Mask) -> Mask:

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import SimpleITK as sitk
 import trimesh
 
 from recon.files import meshes, volumes
@@ -22,12 +21,8 @@ from recon.fusion.scene_page import UNKNOWN, row_of
 from recon.geometry import rigid
 from recon.segmentation.mass_files import FoundMass
 
-SCHEMA = (
-    "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
-)
 MARKUPS, TRANSFORM, SCRIPT, README = "masses.mrk.json", "target_to_world.tfm", "show.py", "README.txt"
 TEMPLATES = Path(__file__).parent
-SLICE_MM = 0.5  # thickness of a B-scan as a volume of one slice
 
 
 def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: int) -> None:
@@ -42,7 +37,7 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
     for name, path in voxels.items():
         shutil.copyfile(path, folder / f"{name}.nrrd")
     for k in evenly(list(scene.images), scans):
-        volumes.write_volume(folder / f"scan{k:04d}.nrrd", slice_of(scene, k))
+        volumes.write_volume(folder / f"scan{k:04d}.nrrd", _slice_of(scene, k))
     if scene.middle is not None and scene.scans.probe is not None:
         write_transform(folder / TRANSFORM, scene.world_from_target[scene.middle])
         body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
@@ -66,13 +61,14 @@ def models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
     yield from ((name, device_layer(camera)) for name, camera in scene.devices.items())
 
 
-def slice_of(scene: FusedScene, k: int) -> Volume:
+def _slice_of(scene: FusedScene, k: int) -> Volume:
     """B-scan k as a volume of one slice where it was taken."""
     matrix = scene.scans.world_from_pixel[k]
     lengths = np.linalg.norm(matrix[:3, :2], axis=0)
     along = matrix[:3, :2] / lengths
     directions = np.column_stack([along, np.cross(along[:, 0], along[:, 1])])
-    return Volume(scene.images[k][None], matrix[:3, 3], np.append(lengths, SLICE_MM), directions)
+    slice_mm = 0.5  # thickness of a B-scan as a volume of one slice
+    return Volume(scene.images[k][None], matrix[:3, 3], np.append(lengths, slice_mm), directions)
 
 
 def write_transform(path: Path, world_from_target: np.ndarray) -> None:
@@ -81,10 +77,18 @@ def write_transform(path: Path, world_from_target: np.ndarray) -> None:
     3D Slicer reads such a file as the transform of a node to its parent's frame, by its inverse.
     """
     inverse = rigid.invert(world_from_target)
-    transform = sitk.AffineTransform(3)
-    transform.SetMatrix(inverse[:3, :3].ravel().tolist())
-    transform.SetTranslation(inverse[:3, 3].tolist())
-    sitk.WriteTransform(transform, str(path))
+    numbers = " ".join(_itk_number(value) for value in (*inverse[:3, :3].ravel(), *inverse[:3, 3]))
+    header = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
+    path.write_text(f"{header}Parameters: {numbers}\nFixedParameters: 0 0 0\n", encoding="ascii", newline="\n")
+
+
+def _itk_number(value: float) -> str:
+    """The shortest text that is read back as the same number, in the form that ITK writes."""
+    if value == 0:
+        return "0"
+    if abs(value) < 1e-6:
+        return np.format_float_scientific(value, trim="-", exp_digits=1)
+    return np.format_float_positional(value, trim="-")
 
 
 def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
@@ -97,4 +101,5 @@ def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
         place = np.asarray(mass.mesh.center_mass).tolist()
         points.append({"id": str(number), "label": name, "description": told, "position": place, "positionStatus": "defined"})
     one = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
-    return {"@schema": SCHEMA, "markups": [one]}
+    schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
+    return {"@schema": schema, "markups": [one]}

@@ -15,7 +15,6 @@ from recon.errors import InputError
 PLACES = ("camera", "pose", "image")
 CAMERAS = {"cam1": "cam1", "camera1": "cam1", "left": "cam1", "cam2": "cam2", "camera2": "cam2", "right": "cam2"}  # word: device
 FIRST = "cam1"  # which takes the images where names have no camera
-SEPARATORS = ("_", "-", " ", ".")  # that a template's _ stands for in the usual ones
 OF_BOARDS = (  # usual names
     "<camera>/<pose>/<image>",
     "<pose>/<camera>/<image>",
@@ -65,7 +64,8 @@ class Name(NamedTuple):
 def usual(board: bool) -> list[str]:
     """Templates of usual names, of a board's poses or of a surface, with each separator."""
     templates = OF_BOARDS if board else OF_SURFACES
-    return list(dict.fromkeys(template.replace("_", separator) for template in templates for separator in SEPARATORS))
+    separators = ("_", "-", " ", ".")  # that a template's _ stands for in the usual ones
+    return list(dict.fromkeys(template.replace("_", separator) for template in templates for separator in separators))
 
 
 def check(template: str) -> None:

@@ -26,16 +26,11 @@ Picture = NDArray[np.uint8]
 
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
 SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
-OUTSIDE, INSIDE = 0.5, 0.1  # opacity of the skin's two sides: where both were alike, a dome would look like a bowl
-AMBIENT, SUN, SUN_STANDS = 0.5, 4.0, (-1.0, -1.2, -0.5)  # light from the viewer's side, low, so that what is bent shows as bent
-OUTLINE = (255, 210, 60)  # of masses that a B-scan cuts, drawn into it
 FONT, NAME_GAP_PX = (cv2.FONT_HERSHEY_SIMPLEX, 0.5), 4  # of the names, and between them and the outlines
-FIGURES_S = 0.1  # between two sets of figures, and pictures under them: faster ones can't be read
 PANEL_PX = 290  # width of the figures, beside the view
 ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
 FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
 SPACE_MM = np.array([[-100.0, -100.0, 600.0], [100.0, 100.0, 760.0]])  # that is looked at where there is neither skin nor mass
-QUALITY = 85  # of JPEG
 
 
 class BrowserView:
@@ -79,10 +74,11 @@ class BrowserView:
 
     def publish(self, moment: Moment) -> None:
         """Show a moment; see `Publisher`."""
+        figures_s = 0.1  # between two sets of figures, and pictures under them: faster ones can't be read
         with self._server.atomic():
             self._show_probe(moment.world_from_target)
             self._show_scan(moment.scan, moment.distances)
-            if monotonic() - self._written > FIGURES_S:  # figures and picture of one moment
+            if monotonic() - self._written > figures_s:  # figures and picture of one moment
                 self._written = monotonic()
                 self._figures.content = moment_figures.html_of(moment, self._masses, self._picture)
         self._server.flush()
@@ -108,9 +104,10 @@ class BrowserView:
     def _place(self, scan: PlacedScan, picture: Picture) -> None:
         """Show a B-scan where it was taken, to the borders of its outer pixels."""
         (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
+        quality = 85  # of JPEG
         if self._scan is None or self._scan.image.shape != picture.shape:
             self._scan = self._server.scene.add_image(
-                "/scan", picture, width * across, height * down, jpeg_quality=QUALITY, cast_shadow=False, receive_shadow=False
+                "/scan", picture, width * across, height * down, jpeg_quality=quality, cast_shadow=False, receive_shadow=False
             )
         else:
             self._scan.image = picture
@@ -121,12 +118,13 @@ def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
     """A B-scan : (h, w, 3) with the outlines of masses that it cuts, and their names."""
     picture = cv2.cvtColor(scan.image, cv2.COLOR_GRAY2RGB)
     pixel_from_world = np.linalg.inv(scan.world_from_pixel)
+    outline = (255, 210, 60)  # of masses that a B-scan cuts, drawn into it
     for each in distances:
         if each.in_image:
             pieces = np.rint(rigid.apply(pixel_from_world, each.outline)[..., :2]).astype(np.int32)
-            cv2.polylines(picture, list(pieces), False, OUTLINE, 1, cv2.LINE_AA)
+            cv2.polylines(picture, list(pieces), False, outline, 1, cv2.LINE_AA)
             at = name_place(each.name, pieces.reshape(-1, 2), scan.image.shape)
-            for colour, thickness in ((INK, 3), (OUTLINE, 1)):
+            for colour, thickness in ((INK, 3), (outline, 1)):
                 cv2.putText(picture, each.name, at, *FONT, colour, thickness, cv2.LINE_AA)
     return picture
 
@@ -149,9 +147,10 @@ def turn_of(to_from: Array) -> Array:
 
 def _add_scene(server, scene: StillScene):
     """Add what stands still; returns the handle of the probe, which moves."""
+    outside, inside = 0.5, 0.1  # opacity of the skin's two sides: where both were alike, a dome would look like a bowl
     if scene.skin is not None:
-        _add_mesh(server, "/skin", scene.skin, SKIN, "front", OUTSIDE)
-        _add_mesh(server, "/skin/inside", scene.skin, SKIN, "back", INSIDE)
+        _add_mesh(server, "/skin", scene.skin, SKIN, "front", outside)
+        _add_mesh(server, "/skin/inside", scene.skin, SKIN, "back", inside)
     for name, mesh in scene.masses.items():
         _add_mesh(server, f"/masses/{name}", mesh, MASS)
         top = np.array([mesh.bounds[:, 0].mean(), mesh.bounds[0, 1], mesh.bounds[:, 2].mean()])  # y of the world is down
@@ -163,8 +162,10 @@ def _add_scene(server, scene: StillScene):
     server.scene.set_up_direction((0.0, -1.0, 0.0))
     server.scene.configure_default_lights(False)
     server.scene.configure_environment_map(None)
-    server.scene.add_light_ambient("/light", intensity=AMBIENT)
-    server.scene.add_light_directional("/sun", intensity=SUN, position=SUN_STANDS)
+    # light from the viewer's side, low, so that what is bent shows as bent
+    ambient, sun, sun_stands = 0.5, 4.0, (-1.0, -1.2, -0.5)
+    server.scene.add_light_ambient("/light", intensity=ambient)
+    server.scene.add_light_directional("/sun", intensity=sun, position=sun_stands)
     middle, radius = _looked_at(scene)
     server.initial_camera.position = (middle + DISTANCE * radius * ASIDE) * M
     server.initial_camera.look_at = middle * M

@@ -1,4 +1,4 @@
-"""Feeds: a thread a device, which hands on its frames, and opens the device again when it was lost."""
+"""Feeds: a thread a device, which hands on its frames, with their exposures, and opens the device again when it was lost."""
 
 import logging
 from collections.abc import Callable
@@ -7,14 +7,14 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Protocol
 
+from recon.devices.device_clocks import ClockFollower
 from recon.devices.interfaces import DeviceError, Frame
-from recon.navigation.exposure_clock import Exposed
 
 log = logging.getLogger(__name__)
-
 AGAIN_S = 1.0  # after a loss, until the device is opened again
 WAIT_S = 0.2  # for a frame, before looking whether to end
 SILENT_S = 1.0  # without a frame, which is told
+Exposed = Callable[[Frame], int]  # monotonic time : ns of a frame's exposure
 
 
 class Source(Protocol):
@@ -97,3 +97,16 @@ class Feed:
             self.lost += 0 if expected is None else max(0, frame.number - expected)
             expected, heard, self.trouble = frame.number + 1, monotonic(), None
             self.deliver(Arrival(frame, exposed(frame)))
+
+
+@dataclass
+class FollowedClock:
+    """Exposures by a device's clock that is followed; by the arrival as long as too few frames have come."""
+
+    follower: ClockFollower
+
+    def __call__(self, frame: Frame) -> int:
+        """Monotonic time : ns of a frame's exposure."""
+        self.follower.add(frame.time_ns, frame.arrived_ns)
+        clock = self.follower.clock
+        return frame.arrived_ns if clock is None else clock.at(frame.time_ns)

@@ -56,13 +56,13 @@ def distances(bodies: Mapping[str, Body], scan: PlacedScan) -> tuple[MassDistanc
 def _distance(name: str, body: Body, normal: Array, scan: PlacedScan, pixel_from_world: Array) -> MassDistance:
     heights = (body.vertices - scan.world_from_pixel[:3, 3]) @ normal
     low, high = float(heights.min()), float(heights.max())
-    outline = outline_of(body, heights)
+    outline = _outline_of(body, heights)
     places = rigid.apply(pixel_from_world, outline.reshape(-1, 3))[:, :2]
     within = (places >= -0.5) & (places <= np.array(scan.image.shape[::-1]) - 0.5)
     return MassDistance(name, max(low, -high), (low + high) / 2, outline, bool(within.all(axis=1).any()))
 
 
-def outline_of(body: Body, heights: Array) -> Array:
+def _outline_of(body: Body, heights: Array) -> Array:
     """Pieces : (k, 2, 3) mm of the line in which a plane cuts a body, from its vertices' heights : (n,) mm over the plane.
 
     A triangle with vertices on both sides gives one piece, between the two of its sides that the plane cuts.

@@ -16,7 +16,6 @@ from recon.navigation.mass_distances import MassDistance
 from recon.navigation.publishing import Moment
 
 NONE = "–"  # in the place of a figure that there is none of
-QUALITY = 85  # of JPEG
 NARROW = "36em"  # of the window, where viser has a sheet below in place of the panel beside
 
 # The last rules are for a small window, of which the sheet would cover half.
@@ -53,7 +52,8 @@ def html_of(moment: Moment, masses: Iterable[str], picture: NDArray[np.uint8] | 
 
 def _image(picture: NDArray[np.uint8]) -> str:
     """A picture : (h, w, 3) RGB within the text, which is painted with it."""
-    jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
+    quality = 85  # of JPEG
+    jpeg = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     height, width = picture.shape[:2]
     source = f"data:image/jpeg;base64,{b64encode(jpeg).decode()}"
     return f'<img decoding="sync" width="{width}" height="{height}" style="height: auto" src="{source}">'

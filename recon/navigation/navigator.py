@@ -23,8 +23,6 @@ from recon.navigation.placed_scans import PlacedScan, ScanPlacing
 from recon.navigation.publishing import Moment, Outlet, Publisher
 from recon.tracking.tracker import Tracker, Tracking
 
-WAIT_S = 0.5  # for a pair of frames, until it is told that there are none
-STALE_NS = 500_000_000  # beyond the lag, after which a B-scan is shown no more
 NO_POSE = np.full((4, 4), np.nan)
 FACING = rigid.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 650.0])  # a target before camera 1
 
@@ -90,8 +88,10 @@ class Navigator:
 
     def _run(self) -> None:
         number, scan, distances = 0, None, ()
+        stale_ns = 500_000_000  # beyond the lag, after which a B-scan is shown no more
+        wait_s = 0.5  # for a pair of frames, until it is told that there are none
         while not self._stopped.is_set():
-            pair = self.pairs.take(WAIT_S)
+            pair = self.pairs.take(wait_s)
             if pair is None:
                 self._publish(Moment(number, monotonic_ns(), None, "no frames of both cameras", troubles=self._troubles()))
                 continue
@@ -100,7 +100,7 @@ class Navigator:
             self._placing.add_pose(pair.exposed_ns, found.pose.world_from_target if found.found else NO_POSE)
             if (newer := self._placing.newest()) is not None:
                 scan, distances = newer, mass_distances.distances(self.bodies, newer)
-            elif scan is not None and pair.exposed_ns - scan.taken_ns > STALE_NS + self.lag_s * 1e9:
+            elif scan is not None and pair.exposed_ns - scan.taken_ns > stale_ns + self.lag_s * 1e9:
                 scan, distances = None, ()
             self._publish(self._moment(number, pair, found, scan, distances))
 

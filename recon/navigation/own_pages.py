@@ -20,8 +20,6 @@ log = logging.getLogger(__name__)
 QUIET = logging.getLogger(f"{__name__}.handshakes")  # of peers that are no browsers or go away, by tracebacks
 QUIET.setLevel(logging.CRITICAL)
 
-MOST_NAMED = 20  # pages that are refused, each once
-
 
 @contextmanager
 def own_pages_alone(host: str) -> Iterator[None]:
@@ -54,9 +52,10 @@ def own_pages_alone(host: str) -> Iterator[None]:
 def _answer(host: str, refused: set[str], process: Callable | None, connection: Any, request: Any) -> Any:
     """The answer of a server to a request, by `process` if it is from a page of its own."""
     hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    most_named = 20  # pages that are refused, each once
     if not is_own(hosts, origins, host):
         page = short(", ".join(origins or hosts))
-        if page not in refused and len(refused) < MOST_NAMED:
+        if page not in refused and len(refused) < most_named:
             refused.add(page)
             log.warning("view: %s is refused: %s", page, FOREIGN)
         return connection.respond(HTTPStatus.FORBIDDEN, f"{FOREIGN}\n")

@@ -15,7 +15,6 @@ from recon.navigation.feeds import Arrival
 
 Array = NDArray[np.float64]
 
-REMEMBERED_NS = 2_000_000_000  # of poses, more than any scanner's lag and its frames' delay
 WAITING = 8  # B-scans whose pose isn't known yet
 
 
@@ -56,7 +55,8 @@ class ScanPlacing:
             self._poses.clear()
         self._times.append(exposed_ns)
         self._poses.append(world_from_target)
-        while self._times[0] < exposed_ns - REMEMBERED_NS:
+        remembered_ns = 2_000_000_000  # of poses, more than any scanner's lag and its frames' delay
+        while self._times[0] < exposed_ns - remembered_ns:
             self._times.popleft()
             self._poses.popleft()
 

@@ -1,9 +1,10 @@
 """What is published: a scene that stands still, and moments; and a thread a publisher, so that none waits for another."""
 
 import logging
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from threading import Thread
+from threading import Lock, Thread
 from time import monotonic_ns
 from typing import Protocol
 
@@ -12,15 +13,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.navigation.latencies import Latencies, Latency
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.newest import Newest
 from recon.navigation.placed_scans import PlacedScan
 
 log = logging.getLogger(__name__)
-
 Array = NDArray[np.float64]
-
 WAIT_S = 0.2  # for a moment, before looking whether to end
 
 
@@ -33,6 +31,15 @@ class StillScene:
     masses: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)
     probe: trimesh.Trimesh | None = None
     circles: trimesh.Trimesh | None = None  # of the target
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Figures of the last ten seconds."""
+
+    median_ms: float
+    high_ms: float  # 99 of 100 are below
+    rate_hz: float
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,32 @@ class Publisher(Protocol):
 
     def close(self) -> None:
         """End."""
+
+
+@dataclass
+class Latencies:
+    """Times at which things were exposed and published."""
+
+    _pairs: deque[tuple[int, int]] = field(default_factory=deque)
+    _lock: Lock = field(default_factory=Lock)
+
+    def add(self, exposed_ns: int, published_ns: int) -> None:
+        """Take in one, by monotonic times."""
+        remembered_ns = 10_000_000_000
+        with self._lock:
+            self._pairs.append((exposed_ns, published_ns))
+            while self._pairs[0][1] < published_ns - remembered_ns:
+                self._pairs.popleft()
+
+    def figures(self) -> Latency | None:
+        """Median, 99 %, and number a second; None of less than two."""
+        with self._lock:
+            pairs = np.array(self._pairs, np.int64).reshape(-1, 2)
+        fewest = 2  # of which figures are made
+        if len(pairs) < fewest or pairs[-1, 1] <= pairs[0, 1]:
+            return None
+        median, high = np.percentile((pairs[:, 1] - pairs[:, 0]) * 1e-6, [50, 99])
+        return Latency(float(median), float(high), (len(pairs) - 1) / float(pairs[-1, 1] - pairs[0, 1]) * 1e9)
 
 
 @dataclass

@@ -15,6 +15,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.devices.openigtlink.igtl_header import MOST_NAME_BYTES
+from recon.devices.openigtlink.igtl_image import Image
+from recon.devices.openigtlink.igtl_messages import Message, Text, Transform
+from recon.devices.openigtlink.igtl_model import Model
+from recon.devices.openigtlink.igtl_server import Server
 from recon.errors import short
 from recon.freehand.sequences import RAS_FROM_LPS
 from recon.geometry import rigid
@@ -22,9 +26,7 @@ from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
 
 log = logging.getLogger(__name__)
-
 Array = NDArray[np.float64]
-
 TARGET, PROBE = "TargetToRAS", "ProbeToRAS"
 SCAN, STATUS, SKIN, DISTANCES = "BScan", "Status", "Skin", "Distances"
 PROBE_BODY = "Probe"  # a model in the target's frame, to be put under its transform
@@ -62,7 +64,7 @@ class SlicerPublisher:
         self._status = ""
         if scene.skin is not None:
             self._send_model(SKIN, scene.skin, RAS_FROM_LPS)
-        for name, mesh in zip(model_names(scene.masses), scene.masses.values(), strict=True):
+        for name, mesh in zip(_model_names(scene.masses), scene.masses.values(), strict=True):
             self._send_model(name, mesh, RAS_FROM_LPS)
         if scene.probe is not None:
             self._send_model(PROBE_BODY, scene.probe, np.eye(4))
@@ -78,7 +80,7 @@ class SlicerPublisher:
             self._sent = moment.scan
             taken = moment.scan.taken_ns + self._since_1970
             self._sender.image(SCAN, moment.scan.image, RAS_FROM_LPS @ moment.scan.world_from_pixel, taken)
-            self._sender.text(DISTANCES, distances_line(moment), taken)
+            self._sender.text(DISTANCES, _distances_line(moment), taken)
         if moment.status != self._status:
             self._status = moment.status
             self._sender.text(STATUS, self._status, now)
@@ -91,7 +93,7 @@ class SlicerPublisher:
         self._sender.model(name, rigid.apply(ras_from_mesh, np.asarray(mesh.vertices)), np.asarray(mesh.faces, np.int64))
 
 
-def model_names(masses: Iterable[str]) -> list[str]:
+def _model_names(masses: Iterable[str]) -> list[str]:
     """Names of masses as Slicer gets them: short enough for a message, and distinct from each other and from what else is sent.
 
     A name that isn't sent as it is but for a capital is logged.
@@ -115,6 +117,33 @@ def _shortened(name: str, end: str = "") -> str:
     return name.encode()[: MOST_NAME_BYTES - len(end)].decode(errors="ignore") + end
 
 
-def distances_line(moment: Moment) -> str:
+def _distances_line(moment: Moment) -> str:
     """Distances of the B-scan's plane from the masses, as one line."""
     return "; ".join(f"{each.name} {each.distance_mm:.1f} mm{', cut' * each.cut}" for each in moment.distances)
+
+
+class IgtlSender:
+    """A `recon.navigation.slicer_publisher.Sender` that publishes by a server, and closes it in the end."""
+
+    def __init__(self, server: Server) -> None:
+        self._server = server
+
+    def transform(self, name: str, ras_from_frame: Array, time_ns: int) -> None:
+        """Send a transform : (4, 4) mm."""
+        self._server.publish(Message(name, Transform(ras_from_frame), time_ns))
+
+    def image(self, name: str, levels: NDArray[np.uint8], ras_from_index: Array, time_ns: int) -> None:
+        """Send an image : (h, w) in its place."""
+        self._server.publish(Message(name, Image(levels, ras_from_index), time_ns))
+
+    def model(self, name: str, points: Array, triangles: NDArray[np.int64]) -> None:
+        """Send a surface."""
+        self._server.publish(Message(name, Model(points, triangles)))
+
+    def text(self, name: str, text: str, time_ns: int) -> None:
+        """Send a line of text."""
+        self._server.publish(Message(name, Text(text), time_ns))
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._server.close()

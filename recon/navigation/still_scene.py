@@ -11,9 +11,6 @@ from recon.model.rig import Target
 from recon.navigation.publishing import StillScene
 from recon.segmentation import containment, mass_files
 
-STEP_MM = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
-LEAST_SIDED = 0.01  # of a skin's area, by which more of it looks away than towards camera 1, to be turned
-
 
 def read_scene(
     skin_file: Path | None, masses: Path | None, target: Target, probe: ProbeCalibration, width: int, part_table: bool = True
@@ -45,7 +42,8 @@ def read_scene(
 def _coarse(path: Path, part_table: bool) -> trimesh.Trimesh:
     whole = containment.read_skin(path)
     parted = skin.by_plane(whole).skin if part_table else whole
-    return outside_out(fused_scene.merged(whole if parted is None else parted, STEP_MM))
+    step_mm = 2.0  # of the skin's vertices, which are merged to that: 20 000 triangles of a breast
+    return outside_out(fused_scene.merged(whole if parted is None else parted, step_mm))
 
 
 def outside_out(skin: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -55,7 +53,8 @@ def outside_out(skin: trimesh.Trimesh) -> trimesh.Trimesh:
     """
     areas = np.asarray(skin.area_faces)
     away = areas @ np.asarray(skin.face_normals) @ (skin.centroid / np.linalg.norm(skin.centroid))
-    if away <= LEAST_SIDED * areas.sum():
+    least_sided = 0.01  # of a skin's area, by which more of it looks away than towards camera 1, to be turned
+    if away <= least_sided * areas.sum():
         return skin
     turned = skin.copy()
     turned.invert()

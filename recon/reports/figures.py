@@ -25,7 +25,6 @@ DIVERGING, CYCLIC, SEQUENTIAL = "RdBu_r", "twilight", "viridis"
 QUALITY = 88  # of WebP: no visible loss in sensor noise
 BARS, LINE = "#5b8db8", "#c8553d"  # what is measured, and what it is held against: both stand out from light and from dark
 TEXT = "#0a0b0c"  # stands for the page's text colour until the drawing is in the page
-ARROW = 0.04  # of an image's width: length of an arrow to be seen well
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,8 @@ def arrows(starts: NDArray, vectors: NDArray, size: tuple[int, int], magnificati
 
 def magnification(size: tuple[int, int], length: float) -> float:
     """A round factor for `arrows` by which a vector of a length, px, becomes as long as suits an image of a size."""
-    wanted = ARROW * size[0] / max(length, 1e-9)
+    arrow = 0.04  # of an image's width: length of an arrow to be seen well
+    wanted = arrow * size[0] / max(length, 1e-9)
     step = 10 ** np.floor(np.log10(wanted))
     return float(step * max(k for k in (1, 2, 5) if k * step <= wanted))
 

@@ -11,12 +11,9 @@ from plotly import graph_objects
 from recon.reports.figures import DIVERGING, Map, Mask, Scale
 
 VERTICES = 60_000  # of a 3-D view; a laptop without a graphics card turns these smoothly
-FEWER_VERTICES = 12_000  # of a surface that is there for what lies under it
-SHEET_STEP = 4  # px of a B-scan for one of its picture in space
 EYE = {"eye": {"x": -0.6, "y": -1.5, "z": 1.05}, "center": {"x": 0.02, "y": -0.05, "z": -0.22}}
 EYE_INSIDE = {"eye": {"x": -0.8, "y": -1.45, "z": 0.85}, "center": {"x": 0.0, "y": 0.0, "z": -0.16}}
 LEGEND = {"x": 0.99, "xanchor": "right", "y": 0.93, "bgcolor": "rgba(0,0,0,0)", "itemsizing": "constant"}  # beside no axis
-LONGEST = 6.0  # times the median: a longer triangle spans a tear
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +79,8 @@ def surface_view(points: Map, error: Map, half_range: float = 0.1) -> str:
 def surface_shape(points: Map, shown: Mask, name: str, colour: str, opacity: float) -> Shape:
     """A surface for `inside_view`, thinned out more: points : (h, w, 3) mm as of `surface_view`, where shown : (h, w)."""
     shown = shown & np.isfinite(points).all(axis=-1)
-    coarse = _thinned(shown, FEWER_VERTICES)
+    fewer_vertices = 12_000  # of a surface that is there for what lies under it
+    coarse = _thinned(shown, fewer_vertices)
     vertices, triangles = _triangulated(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
     return Shape(name, vertices, triangles, colour, opacity)
 
@@ -101,12 +99,13 @@ def inside_view(shapes: Sequence[Shape], lines: Sequence[Lines], sheets: Sequenc
         named.add(name)
         return {"name": name, "legendgroup": name, "showlegend": first}
 
+    sheet_step = 4  # px of a B-scan for one of its picture in space
     for sheet in sheets:
-        rows, columns = (np.arange(0, size, SHEET_STEP) for size in sheet.image.shape)
+        rows, columns = (np.arange(0, size, sheet_step) for size in sheet.image.shape)
         u, v = np.meshgrid(columns, rows)
         pixels = np.stack([u, v, np.zeros_like(u)], axis=-1)
         place = np.float32(pixels @ sheet.world_from_pixel[:3, :3].T + sheet.world_from_pixel[:3, 3])
-        blurred = cv2.blur(sheet.image, (SHEET_STEP, SHEET_STEP))[np.ix_(rows, columns)]
+        blurred = cv2.blur(sheet.image, (sheet_step, sheet_step))[np.ix_(rows, columns)]
         grey = {"colorscale": [[0, "#000000"], [1, "#ffffff"]], "cmin": 0, "cmax": 255, "showscale": False, "hoverinfo": "skip"}
         flat = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
         axes = dict(zip("xyz", np.moveaxis(place, -1, 0), strict=True))
@@ -171,6 +170,7 @@ def _triangulated(points: Map) -> tuple[Map, NDArray[np.int32]]:
     a, b, c, d = (points[corner] for corner in corners)
     reach = np.max([np.linalg.norm(p - q, axis=-1) for p, q in ((a, b), (a, c), (b, d), (c, d), (b, c))], axis=0)
     whole = np.isfinite(reach)
-    whole[whole] = reach[whole] < LONGEST * np.median(reach[whole]) if whole.any() else False
+    longest = 6.0  # times the median: a longer triangle spans a tear
+    whole[whole] = reach[whole] < longest * np.median(reach[whole]) if whole.any() else False
     ia, ib, ic, id_ = (number[corner][whole] for corner in corners)
     return points[known], np.concatenate([np.stack([ia, ic, ib], axis=1), np.stack([ib, ic, id_], axis=1)])

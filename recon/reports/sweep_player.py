@@ -15,7 +15,6 @@ from recon.reports.space_views import Shape, Sheet
 
 Array = NDArray[np.float64]
 
-STEP_PX = 3  # of a B-scan's pixels, for one of its picture in space
 TEMPLATE = Path(__file__).parent / "player.html"
 
 
@@ -58,8 +57,9 @@ class Reel:
 
 def player(view: str, reel: Reel, first: int) -> str:
     """The slider, as HTML, for the view of this name on the page; it begins at B-scan `first`."""
-    thinned = np.stack([cv2.blur(image, (STEP_PX, STEP_PX))[::STEP_PX, ::STEP_PX] for image in reel.images])
-    sheets = reel.world_from_pixel @ np.diag([STEP_PX, STEP_PX, 1, 1])
+    step_px = 3  # of a B-scan's pixels, for one of its picture in space
+    thinned = np.stack([cv2.blur(image, (step_px, step_px))[::step_px, ::step_px] for image in reel.images])
+    sheets = reel.world_from_pixel @ np.diag([step_px, step_px, 1, 1])
     content: Mapping[str, object] = {
         "sheet": reel.sheet,
         "rows": thinned.shape[1],

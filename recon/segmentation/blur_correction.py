@@ -54,7 +54,7 @@ class Blur:
         return np.interp(depths, *np.transpose(self.slice_mm))
 
 
-class Beams(NamedTuple):
+class _Beams(NamedTuple):
     """Beams of a B-scan in a lattice of voxels."""
 
     voxel_from_pixel: Array  # (4, 4)
@@ -99,7 +99,7 @@ def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> EchoPower:
             if np.isfinite(matrix).all():
                 pixels = voxel_from_world @ matrix
                 aside, through = pixels[:3, 0] / across, pixels[:3, 2] / np.linalg.norm(matrix[:3, 2])
-                beams = Beams(pixels, planes.blur.lateral_mm * aside, np.outer(slices, through))
+                beams = _Beams(pixels, planes.blur.lateral_mm * aside, np.outer(slices, through))
                 threads.in_threads(_fill_echoes, len(image), field.voxels, beams, image)
             yield Placed(image[planes.rows.start :], light, u, v)
 

@@ -26,19 +26,11 @@ from recon.threads import in_threads
 Array = NDArray[np.float64]
 
 REACH_MM = 2.4  # of a profile, on either side of the surface
-NEARBY = 1.1  # times that: distance of a profile's voxel from its vertex, as vertices lie closer than voxels
 BIN_MM = 0.2
-MOST_MM = 1.0  # by which a vertex is moved in one round
-STEP_MM = 0.1  # between trial places
-BLURS_MM = (0.25, 0.4, 0.6)  # trial standard deviations; with a narrower one more steps are found beside lines
 PATCH_MM = 1.0  # standard deviation of the weights by which neighbours are averaged
 FARTHEST = 2.5  # patches: neighbours beyond count nothing
-STAY = 0.1  # of the median certainty: weight of the place before
-UNLIKE = 0.05  # of tissue's power, by which blurs differ from those tried
 EVENINGS = 10  # rounds of smoothing over neighbouring vertices
-LINE_GAIN = 1.5  # by which the misfit must be less with a line on the border
 NEVER = 1e9  # misfit of no step up, or of a dark line
-FLOOR = 0.05  # of tissue's power: no level counts as more certain than that of this
 RIDGE = 1e-9  # on the diagonal of the normal equations, for profiles without data
 OUTSIDE, INSIDE, LINE = 0, 1, 2  # rows of a trial: shares of both levels, and the bright line
 
@@ -73,7 +65,8 @@ def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM)
     mass, total = mixed[:, :bins], mixed[:, bins:]
     step, doubt = _steps(np.divide(total, mass, out=np.zeros_like(total), where=mass > 0), mass)
     sure, pull = mix(vertices, normals, np.column_stack([1 / doubt, step / doubt]), patch_mm).T
-    moved = pull / (sure + STAY * np.median(sure))  # uncertain vertices stay
+    stay = 0.1  # of the median certainty: weight of the place before
+    moved = pull / (sure + stay * np.median(sure))  # uncertain vertices stay
     return Refined(evened(rough, vertices + moved[:, None] * normals), moved)
 
 
@@ -136,8 +129,9 @@ def evened(mesh: trimesh.Trimesh, vertices: Array) -> trimesh.Trimesh:
 def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], Array, Array, Array]:
     """Voxels with data near a surface: the nearest vertex, distance (positive outside), power and weight."""
     volume = power.volume
+    nearby = 1.1  # times that: distance of a profile's voxel from its vertex, as vertices lie closer than voxels
     farthest, spared = (
-        NEARBY * REACH_MM,
+        nearby * REACH_MM,
         np.linalg.norm(volume.spacing) / 2,
     )  # a vertex lies up to this far from its voxel's centre
     voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), rough.vertices)
@@ -173,20 +167,26 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     better with it.
     """
     s = -REACH_MM + BIN_MM * (np.arange(profiles.shape[1]) + 0.5)
-    candidates = np.arange(-MOST_MM, MOST_MM + STEP_MM / 2, STEP_MM)
-    weight = weight / np.maximum(uniform_filter1d(profiles, 5, axis=1, mode="nearest"), FLOOR)
-    z = (s - candidates[:, None, None]) / np.array(BLURS_MM)[:, None]
+    most_mm = 1.0  # by which a vertex is moved in one round
+    step_mm = 0.1  # between trial places
+    candidates = np.arange(-most_mm, most_mm + step_mm / 2, step_mm)
+    floor = 0.05  # of tissue's power: no level counts as more certain than that of this
+    weight = weight / np.maximum(uniform_filter1d(profiles, 5, axis=1, mode="nearest"), floor)
+    blurs_mm = (0.25, 0.4, 0.6)  # trial standard deviations; with a narrower one more steps are found beside lines
+    z = (s - candidates[:, None, None]) / np.array(blurs_mm)[:, None]
     trials = np.stack([ndtr(z), ndtr(-z), np.exp(-z * z / 2)], axis=2)  # (places, blurs, 3, bins)
     plain, lined = misfits(profiles, weight, trials)
-    least = UNLIKE**2 * weight.sum(axis=1)
-    costs = np.where(plain.min(axis=0) + least > LINE_GAIN * (lined.min(axis=0) + least), lined, plain)
+    unlike = 0.05  # of tissue's power, by which blurs differ from those tried
+    least = unlike**2 * weight.sum(axis=1)
+    line_gain = 1.5  # by which the misfit must be less with a line on the border
+    costs = np.where(plain.min(axis=0) + least > line_gain * (lined.min(axis=0) + least), lined, plain)
     c = np.clip(costs.argmin(axis=0), 1, len(candidates) - 2)
     rows = np.arange(len(profiles))
     before, here, after = costs[c - 1, rows], costs[c, rows], costs[c + 1, rows]
     bend = np.maximum(before + after - 2 * here, 1e-9)
     shift = np.clip((before - after) / (2 * bend), -0.5, 0.5)
     found = (here < NEVER) & (costs.argmin(axis=0) == c)  # not at an end of the trials
-    return np.where(found, candidates[c] + shift * STEP_MM, 0.0), np.where(found, here / bend + 1e-3, NEVER)
+    return np.where(found, candidates[c] + shift * step_mm, 0.0), np.where(found, here / bend + 1e-3, NEVER)
 
 
 def misfits(profiles: Array, weight: Array, trials: Array) -> tuple[Array, Array]:

@@ -13,8 +13,6 @@ from recon.geometry.surface_tree import surface_tree
 
 Array = NDArray[np.float64]
 
-LEAST_COVERED = 0.5  # of a mesh's vertices, to call it inside
-
 
 @dataclass(frozen=True)
 class Containment:
@@ -54,7 +52,8 @@ class Containment:
         """Whether every vertex lies inside: False if a covered one doesn't, None (unknown) if not more than half are covered."""
         if self.least_mm <= 0:
             return False
-        return True if self.covered > LEAST_COVERED else None
+        least_covered = 0.5  # of a mesh's vertices, to call it inside
+        return True if self.covered > least_covered else None
 
 
 def read_skin(path: Path) -> trimesh.Trimesh:

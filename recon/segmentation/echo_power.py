@@ -28,8 +28,6 @@ SLICE_MM = (  # the same across the image plane, at some depths: (depth, sigma)
     *((4.0, 0.91), (8.0, 0.63), (12.0, 0.37), (15.0, 0.24), (20.0, 0.24)),
     *((30.0, 0.37), (40.0, 0.56), (50.0, 0.8)),
 )
-VOXEL_BYTES = 48  # that finding masses takes a voxel, at most
-BRIGHTEST = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
 MEDIAN_OF_MEAN = np.log(2)  # of the power of speckle, which is exponentially distributed
 
 
@@ -79,7 +77,8 @@ def beam_grid(world_from_pixel: Array, shape: tuple[int, int], spacing_mm: Spaci
     array = array / np.linalg.norm(array)
     directions = np.column_stack([array, beam, np.cross(array, beam)])
     grid = volume_compounding.grid_over(around, directions, np.array(spacing_mm))
-    most, needed = volume_compounding.MOST_BYTES / 2**30, math.prod(grid.size) * VOXEL_BYTES / 2**30
+    voxel_bytes = 48  # that finding masses takes a voxel, at most
+    most, needed = volume_compounding.MOST_BYTES / 2**30, math.prod(grid.size) * voxel_bytes / 2**30
     if needed > most:
         found = f"{needed:.0f} GiB for {' x '.join(map(str, grid.size))} voxels; clip the images"
         raise InputError(f"power: expected at most {most:.0f} GiB, found {found}")
@@ -112,7 +111,8 @@ def averaged(
 def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:
     """Power of each grey level : (256,), relative to the mean of tissue whose median level is given."""
     decibels = (np.arange(256) - tissue_grey) * dynamic_range_db / 255
-    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), BRIGHTEST)
+    brightest = 10**0.8  # times tissue: brighter echoes count as 8 dB above it, such as those of walls square to the beam
+    table = np.minimum(MEDIAN_OF_MEAN * 10 ** (decibels / 10), brightest)
     table[0] = 0
     return table.astype(np.float32)
 

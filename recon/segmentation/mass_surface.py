@@ -19,11 +19,7 @@ from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 
-EVEN_MM = 0.5  # standard deviation; lobes of the blurred borders are wider
-MESH_MM = 0.5  # between vertices
-LEVELLINGS = 4  # Newton's steps to the level that holds the volume
 NEAR_MM = 1.5  # of a vertex, within which distances come from the surface itself
-NEIGHBOURS = 6  # vertices that the distance to a surface is taken from
 FAR_MM = 5.0  # around a mass, to which distances reach
 
 
@@ -50,12 +46,15 @@ def evened(mass: Mass, axes: Array) -> Mass:
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
     Its vertices are `MESH_MM` apart along the axes : (3, 3), columns.
     """
-    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, MESH_MM), NEAR_MM + 3 * EVEN_MM))
-    field, whole = ndimage.gaussian_filter(near.voxels, EVEN_MM / MESH_MM), 3 * (slice(0, None),)
-    level, volume = 0.0, enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
-    for _ in range(LEVELLINGS):
+    even_mm = 0.5  # standard deviation; lobes of the blurred borders are wider
+    mesh_mm = 0.5  # between vertices
+    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, mesh_mm), NEAR_MM + 3 * even_mm))
+    field, whole = ndimage.gaussian_filter(near.voxels, even_mm / mesh_mm), 3 * (slice(0, None),)
+    level, volume = 0.0, _enclosed(np.asarray(mass.mesh.vertices), mass.mesh.faces).sum()
+    levellings = 4  # Newton's steps to the level that holds the volume
+    for _ in range(levellings):
         mesh = meshed(field, level, whole, near, outside=FAR_MM)
-        level += (volume - enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
+        level += (volume - _enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
     return Mass(meshed(field, level, whole, near, outside=FAR_MM))
 
 
@@ -92,7 +91,8 @@ def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...
     apart[tuple(np.clip(voxel, 0, np.array(shape[::-1]) - 1).T[::-1])] = False
     k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
     places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
-    _, nearest = KDTree(mesh.vertices).query(places, k=NEIGHBOURS, workers=numba.get_num_threads())
+    neighbours = 6  # vertices that the distance to a surface is taken from
+    _, nearest = KDTree(mesh.vertices).query(places, k=neighbours, workers=numba.get_num_threads())
     across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
     result = np.full(shape, np.nan)
     result[k, j, i] = across.mean(axis=1)
@@ -104,11 +104,11 @@ def meshed(field: NDArray, level: float, part: tuple[slice, ...], volume: Volume
     vertices, faces, _, _ = marching_cubes(np.pad(field, 1, constant_values=outside), level)
     index = vertices[:, ::-1] - 1 + [s.start for s in part[::-1]]
     places, faces = _largest(rigid.apply(volume.world_from_voxel, index), faces)
-    outwards = faces if enclosed(places, faces).sum() > 0 else faces[:, ::-1]
+    outwards = faces if _enclosed(places, faces).sum() > 0 else faces[:, ::-1]
     return trimesh.Trimesh(places, outwards, process=False)
 
 
-def enclosed(vertices: Array, faces: NDArray[np.int32]) -> Array:
+def _enclosed(vertices: Array, faces: NDArray[np.int32]) -> Array:
     """Signed volumes : (m,) mm^3 of the tetrahedra of triangles and the vertices' mean; they add up to a closed surface's."""
     a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
     return (a * np.cross(b, c)).sum(axis=1) / 6
@@ -121,7 +121,7 @@ def _largest(vertices: Array, faces: NDArray[np.int32]) -> tuple[Array, NDArray[
     count, label = csgraph.connected_components(joined, directed=False)
     if count == 1:
         return vertices, faces
-    volumes = np.bincount(label[faces[:, 0]], enclosed(vertices, faces), count)
+    volumes = np.bincount(label[faces[:, 0]], _enclosed(vertices, faces), count)
     chosen = label == np.abs(volumes).argmax()
     number = np.cumsum(chosen) - 1
     return vertices[chosen], number[faces[chosen[faces[:, 0]]]]

@@ -23,7 +23,6 @@ from recon.segmentation.mass_surface import Mass
 
 Array = NDArray[np.float64]
 
-NEAR_MM = 1.0  # of a B-scan's plane: a point there is shown by it
 BORDER_MM = (
     0.06  # standard deviation of a border's place as a whole, along each axis and outwards, by speckle; see docs/freehand.md
 )
@@ -76,7 +75,7 @@ def by_all(mass: Mass, scans: Scans, speeds: Speeds, under: Containment | None =
     if scans.probe is None or scans.probe.uncertainty is None:
         return Sigma(np.nan, np.nan)
     weights, shown = weights_of(mass, under), shown_by(np.asarray(mass.mesh.vertices), scans)
-    covariance = by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + by_border(mass, under)
+    covariance = _by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + _by_border(mass, under)
     centre, volume, depth = np.trace(covariance[:3, :3]), covariance[3, 3], covariance[4, 4]
     depth = np.nan if under is None or not np.isfinite(under.least_mm) else depth
     return Sigma(*np.sqrt([centre, volume, depth]).tolist())
@@ -101,13 +100,14 @@ def shown_by(points: Array, scans: Scans) -> Shown:
     size = np.array(scans.shape[::-1])
     pairs, pixels = [], []
     nearest, closest, seen = np.full((len(points), 3), np.nan), np.full(len(points), np.inf), np.zeros(len(points), bool)
+    near_mm = 1.0  # of a B-scan's plane: a point there is shown by it
     for k in np.flatnonzero(np.isfinite(scans.world_from_pixel).all(axis=(1, 2))).tolist():
         world_from_pixel = scans.world_from_pixel[k]
         local = rigid.apply(np.linalg.inv(world_from_pixel), points)
         away = np.abs(local[:, 2]) * np.linalg.norm(world_from_pixel[:3, 2])
         beside = np.maximum(np.maximum(-0.5 - local[:, :2], local[:, :2] - (size - 0.5)), 0)
         away = np.hypot(away, np.linalg.norm(beside * np.linalg.norm(world_from_pixel[:3, :2], axis=0), axis=1))
-        shown, closer = (beside == 0).all(axis=1) & (away < NEAR_MM), away < closest
+        shown, closer = (beside == 0).all(axis=1) & (away < near_mm), away < closest
         pairs.append(np.column_stack([np.flatnonzero(shown), np.full(shown.sum(), k)]))
         pixels.append(local[shown, :2])
         nearest[closer], closest[closer] = np.column_stack([np.full(closer.sum(), k), local[closer, :2]]), away[closer]
@@ -118,7 +118,7 @@ def shown_by(points: Array, scans: Scans) -> Shown:
     return Shown(vertex, scan, pixel, 1 / np.bincount(vertex, minlength=len(points))[vertex])
 
 
-def by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
+def _by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
     """Covariance : (5, 5) of centre, volume and depth by what places the B-scans."""
     probe, errors = scans.probe, scans.errors
     assert probe is not None and probe.uncertainty is not None
@@ -148,7 +148,7 @@ def by_speeds(mass: Mass, weights: Weights, shown: Shown, scans: Scans, speeds: 
     return np.outer(by_tissue, by_tissue) * speeds.tissue**2 + np.outer(by_within, by_within) * speeds.within**2
 
 
-def by_border(mass: Mass, under: Containment | None) -> Array:
+def _by_border(mass: Mass, under: Containment | None) -> Array:
     """Covariance : (5, 5) of centre, volume and depth by the border's own scatter, and the skin's."""
     skin_mm = 0.0 if under is None else under.sigma_mm
     return np.diag([BORDER_MM, BORDER_MM, BORDER_MM, BORDER_MM * mass.mesh.area, np.hypot(BORDER_MM, skin_mm)]) ** 2

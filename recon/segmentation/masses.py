@@ -28,13 +28,7 @@ Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SPACING_MM = (0.5, 0.25, 0.5)  # along the array, the beam and across; a border square to the beam is a line of its pulse
-BESIDE_MM = 0.25  # half of the widest voxel
-BLUR_REACH = 4  # standard deviations to which a blur reaches
-TOP_MM = 3.0  # ringing at the face, left out
-ROUGHLY = 1  # refinement of the surface, as exact as clearing needs it
 REFINEMENTS = (2, 3)  # after each clearing
-SAMPLED = 40  # images for the level of tissue
-LEAST_GREY = 5.0  # of 255, of tissue
 
 
 @dataclass(frozen=True)
@@ -107,29 +101,31 @@ def from_scans(
     shape = arguments.image_size("shape", shape)
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     sound = sound or Sound()
-    clip = below_face(shape, world_from_pixel)
+    clip = _below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
     spread_mm = blur.lateral_mm if blur else 0.0
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
-    masses = refined(rough(power), power, ROUGHLY)
+    roughly = 1  # refinement of the surface, as exact as clearing needs it
+    masses = refined(rough(power), power, roughly)
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            masses = refined([mass for mass in masses if is_dark(mass, power)], power, times)
+            masses = refined([mass for mass in masses if _is_dark(mass, power)], power, times)
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     return sorted(masses, key=lambda mass: -mass.volume)
 
 
-def below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
+def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
     """The part of images (h, w) below the ringing at the face; InputError if there is none."""
-    top = int(np.ceil(TOP_MM / pixel_mm(world_from_pixel)[1]))
+    top_mm = 3.0  # ringing at the face, left out
+    top = int(np.ceil(top_mm / pixel_mm(world_from_pixel)[1]))
     if top >= shape[0] // 2:
         raise InputError(
-            f"images: expected more than {2 * TOP_MM:g} mm of depth, found {shape[0]} rows, of which {top} are ringing"
+            f"images: expected more than {2 * top_mm:g} mm of depth, found {shape[0]} rows, of which {top} are ringing"
         )
     return Clip(0, top, shape[1], shape[0])
 
@@ -142,17 +138,19 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     InputError
         If these are black: gel, a standoff, or water.
     """
-    top, placed = below_face(shape, world_from_pixel).v, np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2)))
-    chosen = set(placed[:: max(1, len(placed) // SAMPLED)].tolist())
+    top, placed = _below_face(shape, world_from_pixel).v, np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2)))
+    sampled = 40  # images for the level of tissue
+    chosen = set(placed[:: max(1, len(placed) // sampled)].tolist())
     sample = np.stack([image[top : shape[0] // 2] for k, image in enumerate(images) if k in chosen])
     grey = echo_power.typical_grey(sample, slice(None))
-    if grey < LEAST_GREY:
-        expected = f"tissue in the upper half of the B-scans, of a grey level of {LEAST_GREY:g} or more"
+    least_grey = 5.0  # of 255, of tissue
+    if grey < least_grey:
+        expected = f"tissue in the upper half of the B-scans, of a grey level of {least_grey:g} or more"
         raise InputError(f"images: expected {expected}, found {grey:.0f} (median): gel, a standoff, or water?")
     return grey
 
 
-def is_dark(mass: Mass, power: EchoPower) -> bool:
+def _is_dark(mass: Mass, power: EchoPower) -> bool:
     """Whether a mass is still dark after the shadows of others have been taken away."""
     places = mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre)
     voxel = np.rint(rigid.apply(np.linalg.inv(power.volume.world_from_voxel), places)).astype(int)
@@ -321,7 +319,8 @@ def _smoothed(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
 
 def _blurred(field: Map, sigma: Array) -> Map:
     """A Gaussian blur of (nz, ny, nx), reflected at the sides: as `scipy.ndimage.gaussian_filter`, by vector instructions."""
-    aside, down, across = (cv2.getGaussianKernel(2 * round(BLUR_REACH * one) + 1, one, cv2.CV_32F) for one in sigma)
+    blur_reach = 4  # standard deviations to which a blur reaches
+    aside, down, across = (cv2.getGaussianKernel(2 * round(blur_reach * one) + 1, one, cv2.CV_32F) for one in sigma)
     sheets = np.empty_like(field)
     for sheet, blurred in zip(field, sheets, strict=True):
         cv2.sepFilter2D(sheet, -1, across, down, dst=blurred, borderType=cv2.BORDER_REFLECT)
@@ -332,7 +331,8 @@ def _blurred(field: Map, sigma: Array) -> Map:
 def _opened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """The voxels of a mask that lie in balls which fit into it, or no more than `BESIDE_MM` away."""
     core = ~_widened(~mask, radius_mm, spacing)
-    return mask & _widened(core, radius_mm + BESIDE_MM, spacing)
+    beside_mm = 0.25  # half of the widest voxel
+    return mask & _widened(core, radius_mm + beside_mm, spacing)
 
 
 def _widened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:

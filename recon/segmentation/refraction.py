@@ -43,7 +43,7 @@ class Lines(NamedTuple):
     inside: NDArray[np.bool_]  # whether the place lies in a mass
 
 
-class Medium(NamedTuple):
+class _Medium(NamedTuple):
     """Masses in tissue, in the frame of a B-scan."""
 
     field: Map  # (nz, ny, nx) signed distance to the masses' surface, mm, negative inside
@@ -73,7 +73,7 @@ def follow(
     voxel_from_pixel = np.linalg.inv(inside.world_from_voxel) @ world_from_pixel
     columns = np.arange(0, shape[1], every)
     lines = Lines(*(np.empty((shape[0], len(columns)), kind) for kind in (*4 * (np.float32,), bool)))
-    _follow(Medium(inside.voxels, voxel_from_pixel, pixel_mm, sound.mass / sound.tissue), columns, lines)
+    _follow(_Medium(inside.voxels, voxel_from_pixel, pixel_mm, sound.mass / sound.tissue), columns, lines)
     return lines
 
 

@@ -10,7 +10,6 @@ Overlay = NDArray[np.uint8]  # (h, w, 3), blue, green, red
 Mask = NDArray[np.bool_]
 
 LEAST_PX = 30  # of a mass in a B-scan that is drawn
-SLIT_PX = 7  # width of slits and spikes that are not drawn
 COLOUR = (60, 220, 255)  # of outlines, blue, green, red
 
 
@@ -18,13 +17,13 @@ def of_masks(images: Iterable[NDArray[np.uint8]], masks: Iterable[Mask], count: 
     """Draw the borders of masks : n of (h, w) over some of n B-scans."""
     outlines = {k: mask for k, mask in enumerate(masks) if mask.sum() >= LEAST_PX}
     chosen = spread({k: int(mask.sum()) for k, mask in outlines.items()}, count)
-    return [drawn_over(image, _contours(outlines[k])) for k, image in enumerate(images) if k in chosen]
+    return [_drawn_over(image, _contours(outlines[k])) for k, image in enumerate(images) if k in chosen]
 
 
 def of_outlines(images: Iterable[NDArray[np.uint8]], outlines: Mapping[int, NDArray], count: int) -> list[Overlay]:
     """Draw open outlines : (m, 2) px, by the numbers of their images, over some of n B-scans."""
     chosen = spread({k: len(outline) for k, outline in outlines.items()}, count)
-    return [drawn_over(image, [outlines[k]], closed=False) for k, image in enumerate(images) if k in chosen]
+    return [_drawn_over(image, [outlines[k]], closed=False) for k, image in enumerate(images) if k in chosen]
 
 
 def spread(sizes: Mapping[int, int], count: int) -> set[int]:
@@ -33,7 +32,7 @@ def spread(sizes: Mapping[int, int], count: int) -> set[int]:
     return {max(part.tolist(), key=lambda k: sizes[k]) for part in parts}
 
 
-def drawn_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bool = True) -> Overlay:
+def _drawn_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bool = True) -> Overlay:
     """A B-scan in colour, with outlines : (m, 2) px."""
     result = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for outline in outlines:
@@ -44,7 +43,8 @@ def drawn_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bo
 
 def _contours(mask: Mask) -> list[NDArray]:
     """Borders of a mask, without the slits that neighbouring lines leave which a flank bends differently."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SLIT_PX, SLIT_PX))
-    padded = np.pad(mask.astype(np.uint8), SLIT_PX)
+    slit_px = 7  # width of slits and spikes that are not drawn
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (slit_px, slit_px))
+    padded = np.pad(mask.astype(np.uint8), slit_px)
     whole = cv2.morphologyEx(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc), cv2.MORPH_OPEN, disc)
-    return [line[:, 0] - SLIT_PX for line in cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]
+    return [line[:, 0] - slit_px for line in cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]]

@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 OVERLAYS = 4
 COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm")  # figures
-NONE_FOUND = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,8 @@ def find_masses(
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
-    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {NONE_FOUND}"])]
+    none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
+    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
     lines += [f"blur        {blur}"] if blur is not None and found else []
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
@@ -126,12 +126,12 @@ def find_tube(
         most = f"; most others: {max(set(reasons), key=reasons.count)}" if reasons else ""
         raise InputError(f"{error}{most}") from None
     of_scale = 0.0 if scans.probe is None else tube_wall.scale_sigma(rings, matrices, tube, scans.probe)
-    figures = measure_tube(tube, of_scale)
+    figures = _measure_tube(tube, of_scale)
     diameter, sigma, used = (figures[f"tube_{name}"] for name in ("diameter_mm", "diameter_sigma_mm", "frames"))
     line = f"tube        {diameter:.3f} mm in diameter, sigma {sigma:.3f} mm, {used} B-scans, RMS {tube.rms:.3f} mm"
     outlines = {int(k): rings[k].pixels for k in np.unique(tube.frames)}
     drawn = scan_overlays.of_outlines(scans.stream(), outlines, overlays)
-    ends = ends_of(tube, rings, matrices)
+    ends = _ends_of(tube, rings, matrices)
     inner = Segmented({"tube": between(tube.shape, ends)}, figures, [line], drawn)
     if surface is None:
         return inner
@@ -150,7 +150,7 @@ def covered(inner: Segmented, cover: Cover, ends: Array) -> Segmented:
     return Segmented(inner.meshes | {"cover": between(cover.shape, ends)}, figures, [*inner.lines, line], inner.overlays)
 
 
-def measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
+def _measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
     """Figures of a tube, each named with its unit, with the part of the radius' standard deviation due to the probe's scale."""
     return {
         "tube_diameter_mm": 2 * tube.shape.radius,
@@ -162,7 +162,7 @@ def measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:
     }
 
 
-def ends_of(tube: Tube, rings: Sequence[Ring], matrices: Array) -> Array:
+def _ends_of(tube: Tube, rings: Sequence[Ring], matrices: Array) -> Array:
     """Ends : (2, 3) mm of the measured part of a tube, on its axis."""
     points = np.concatenate([tube_wall.in_world(rings[k].pixels, matrices[k]) for k in np.unique(tube.frames)])
     along = (points - tube.shape.point) @ tube.shape.axis

@@ -23,10 +23,6 @@ from recon.segmentation.refraction import Sound, follow
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
-CLEAR_MM = 2.0  # from a border, where pixels show one tissue only
-MOST_BY_PATH = 0.25  # nepers a mm: 11 dB/cm more than tissue, there and back
-MOST_LOSS = 0.05  # of power left: darker pixels are left out
-THINNED = 4  # pixels, columns and rows, of which one counts for the losses
 DEPTH_BINS, PATH_BINS = 60, 40  # of 1 mm
 
 
@@ -47,13 +43,15 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
     by_depth, by_path = losses(recording, inside, sound)
     table, top = recording.table, recording.clip.v
 
+    most_loss = 0.05  # of power left: darker pixels are left out
+
     def place(image: NDArray[np.uint8], matrix: Array) -> Placed:
         if not np.isfinite(matrix).all():
             return Placed(*4 * (table[image],))  # counts nothing
         lines = follow(inside, scale, matrix, image.shape, sound)
         rows = np.arange(image.shape[0], dtype=np.float32)[:, None] * scale[1]
         light = ndimage.gaussian_filter(lines.passed * np.exp(-by_path * lines.within), (0, recording.spread_mm / scale[0]))
-        power = np.where(light > MOST_LOSS, table[image] * np.exp(by_depth * rows), np.nan)
+        power = np.where(light > most_loss, table[image] * np.exp(by_depth * rows), np.nan)
         return Placed(*(field[top:].astype(np.float32) for field in (power, light, lines.u, lines.v)))
 
     placed = threads.mapped(place, recording.images(), recording.world_from_pixel)
@@ -66,15 +64,18 @@ def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, f
     Fitted to the mean power of tissue some mm around the masses, by depth and length of the way through masses.
     """
     scale, table = pixel_mm(recording.world_from_pixel), recording.table
-    rows = slice(recording.clip.v, None, THINNED)
+    thinned = 4  # pixels, columns and rows, of which one counts for the losses
+    rows = slice(recording.clip.v, None, thinned)
+
+    clear_mm = 2.0  # from a border, where pixels show one tissue only
 
     def binned(scan: tuple[NDArray[np.uint8], Array]) -> tuple[NDArray[np.int64], Array]:
         image, matrix = scan
-        lines = follow(inside, scale, matrix, image.shape, sound, THINNED)
+        lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         u, v, within, passed = (a[rows] for a in (lines.u, lines.v, lines.within, lines.passed))
-        power = table[image[rows, ::THINNED]]
+        power = table[image[rows, ::thinned]]
         away = _sampled(inside, matrix, u, v)
-        used = (away > CLEAR_MM) & (away < FAR_MM - 0.2) & (passed > 0.5)
+        used = (away > clear_mm) & (away < FAR_MM - 0.2) & (passed > 0.5)
         bins = np.minimum(v[used] * scale[1], DEPTH_BINS - 1).astype(int) * PATH_BINS
         return bins + np.minimum(within[used], PATH_BINS - 1).astype(int), power[used] / passed[used]
 
@@ -97,7 +98,8 @@ def _fitted_losses(total: Array, count: Array) -> tuple[float, float]:
     design = np.column_stack([np.ones(enough.sum()), -(depth + 0.5), -path]) * np.sqrt(count[enough])[:, None]
     level = np.log(total[enough] / count[enough]) * np.sqrt(count[enough])
     _, by_depth, by_path = np.linalg.lstsq(design, level)[0]
-    return float(max(by_depth, 0.0)), float(np.clip(by_path, 0.0, MOST_BY_PATH))
+    most_by_path = 0.25  # nepers a mm: 11 dB/cm more than tissue, there and back
+    return float(max(by_depth, 0.0)), float(np.clip(by_path, 0.0, most_by_path))
 
 
 def _sampled(inside: Volume, world_from_pixel: Array, u: NDArray, v: NDArray) -> Array:

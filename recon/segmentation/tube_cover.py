@@ -17,15 +17,6 @@ from recon.geometry.primitives import Cylinder, Fit, fit_cylinder
 
 Array = NDArray[np.float64]
 
-HALF_ARC_DEG = 75.0  # about the tube's axis, on either side of the direction to the camera
-LEAST_POINTS = 1000
-MOST_POINTS = 100_000  # evenly chosen; more would change the radius by less than a micrometre
-OUTLIER = 4.0  # standard deviations, by the median absolute deviation
-ROUNDS = 3
-LEAST_ARC_DEG = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
-MOST_TURN_DEG = 20.0  # between both axes
-MOST_RMS_MM = 0.3  # of the points about the cylinder: light is ten times as exact
-
 
 @dataclass(frozen=True)
 class Cover:
@@ -51,19 +42,24 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
         If too little surface lies before the tube, it isn't round, or the tube isn't within it.
     """
     points = before(np.asarray(surface.vertices, float), tube, ends)
-    if len(points) < LEAST_POINTS:
-        raise InputError(f"surface: expected {LEAST_POINTS} points before the tube, found {len(points)}; another session?")
-    points = points[:: -(-len(points) // MOST_POINTS)]
+    least_points = 1000
+    if len(points) < least_points:
+        raise InputError(f"surface: expected {least_points} points before the tube, found {len(points)}; another session?")
+    most_points = 100_000  # evenly chosen; more would change the radius by less than a micrometre
+    points = points[:: -(-len(points) // most_points)]
     try:
         fit, points = _robust(points)
     except (ValueError, np.linalg.LinAlgError):
         raise InputError("surface: expected a round body about the tube, found no cylinder through it") from None
     turn = np.rad2deg(np.arccos(min(1.0, abs(float(fit.shape.axis @ tube.axis)))))
-    arc = arc_deg(points, fit.shape)
+    arc = _arc_deg(points, fit.shape)
+    most_turn_deg = 20.0  # between both axes
+    most_rms_mm = 0.3  # of the points about the cylinder: light is ten times as exact
+    least_arc_deg = 70.0  # of the surface about the fitted axis; less leaves the radius to chance
     wrong = {
-        f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > MOST_RMS_MM,
-        f"a cylinder turned by {turn:.0f} deg against the tube": turn > MOST_TURN_DEG,
-        f"an arc of {arc:.0f} deg": arc < LEAST_ARC_DEG,
+        f"{fit.rms:.2g} mm RMS off a cylinder": fit.rms > most_rms_mm,
+        f"a cylinder turned by {turn:.0f} deg against the tube": turn > most_turn_deg,
+        f"an arc of {arc:.0f} deg": arc < least_arc_deg,
     }
     found = [text for text, holds in wrong.items() if holds]
     if found:
@@ -74,9 +70,11 @@ def fit_cover(surface: trimesh.Trimesh, tube: Cylinder, ends: Array) -> Cover:
 def _robust(points: Array) -> tuple[Fit[Cylinder], Array]:
     """Cylinder through points : (n, 3) mm, and those near it."""
     fit = fit_cylinder(points)
-    for _ in range(ROUNDS):
+    outlier = 4.0  # standard deviations, by the median absolute deviation
+    rounds = 3
+    for _ in range(rounds):
         away = np.abs(fit.residuals - np.median(fit.residuals))
-        points = points[away < OUTLIER * NORMAL_MAD * np.median(away) + 1e-9]
+        points = points[away < outlier * NORMAL_MAD * np.median(away) + 1e-9]
         fit = fit_cylinder(points)
     return fit, points
 
@@ -86,11 +84,12 @@ def before(points: Array, tube: Cylinder, ends: Array) -> Array:
     local = points - tube.point
     along, (first, last) = local @ tube.axis, np.sort((ends - tube.point) @ tube.axis)
     across = local - np.outer(along, tube.axis)
-    facing = across @ to_camera(tube) > np.cos(np.deg2rad(HALF_ARC_DEG)) * np.linalg.norm(across, axis=1)
+    half_arc_deg = 75.0  # about the tube's axis, on either side of the direction to the camera
+    facing = across @ to_camera(tube) > np.cos(np.deg2rad(half_arc_deg)) * np.linalg.norm(across, axis=1)
     return points[facing & (along > first) & (along < last)]
 
 
-def arc_deg(points: Array, shape: Cylinder) -> float:
+def _arc_deg(points: Array, shape: Cylinder) -> float:
     """Angle, deg, that points : (n, 3) mm span about a cylinder's axis, less their outer hundredths."""
     middle = points.mean(axis=0) - shape.point
     up = middle - (middle @ shape.axis) * shape.axis

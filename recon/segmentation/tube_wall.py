@@ -27,25 +27,8 @@ from recon.segmentation.echo_power import SPREAD_MM
 
 Array = NDArray[np.float64]
 
-SMOOTH_PX = 1.0  # before the first echo of each column is looked for
-TRIALS = 400  # circles through three first echoes
-NEAR_MM = 0.5  # from a circle, of the first echoes that count for it
-LEAST_ARC_DEG = 70.0  # of first echoes; less leaves the radius to chance
-CENTRINGS = 3
-STEP_DEG = 1.0  # between rays
-HALF_ARC_DEG = 85.0  # of rays, on either side of the wall's front
-WINDOW_MM = 1.2  # along a ray, on either side of the rough circle, and
-WINDOW_SPREADS = 3.0  # times the spread along the array
-SAMPLE_MM = 0.02
-EDGE_DB = 10.0  # below the echo's top, where its two edges are taken
-OUTLIER = 3.5  # standard deviations from the smooth outline
-FADING_DEG = 2.0  # sigma of the window in which the brightness' slope along the wall is taken
-CLIPPED = 250.0  # grey level of 255, from which an echo's brightness isn't known
-UNSURE = 2.0  # times the correction for fading, which is its first order alone: standard deviation
 LEAST_EDGES = 40
 FLOOR_MM = 0.01  # no edge counts as more exact than this
-ROBUST = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
-SEED = 0  # of the trials: the same image gives the same ring
 
 
 @dataclass(frozen=True)
@@ -101,17 +84,19 @@ def find(image: NDArray, scale: Array, appearance: Appearance | None = None) -> 
     if level.ndim != 2 or min(level.shape) < 32:
         return _none(f"expected a grey image of at least 32x32 px, found shape {level.shape}")
     grey = 255 / look.dynamic_range_db  # levels a dB
-    first = first_echoes(level, int(np.ceil(look.top_mm / scale[1])), look.min_contrast_db * grey) * scale
+    first = _first_echoes(level, int(np.ceil(look.top_mm / scale[1])), look.min_contrast_db * grey) * scale
     if len(first) < 10:
         return _none("no echo stands out")
     circle, near = _rough_circle(first, look.diameter_mm)
     if near is None:
         return _none(f"no arc of {look.diameter_mm[0]:g} to {look.diameter_mm[1]:g} mm in diameter")
     directions = np.arctan2(first[near, 0] - circle[0], circle[1] - first[near, 1])
-    if np.ptp(directions) < np.deg2rad(LEAST_ARC_DEG):
-        return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {LEAST_ARC_DEG:.0f}")
+    least_arc_deg = 70.0  # of first echoes; less leaves the radius to chance
+    if np.ptp(directions) < np.deg2rad(least_arc_deg):
+        return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {least_arc_deg:.0f}")
     ring = _measured(level, scale, circle, look, grey)
-    for _ in range(CENTRINGS):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
+    centrings = 3
+    for _ in range(centrings):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
         refined = _algebraic(ring.pixels * scale) if ring.found else None
         if refined is None:
             return ring
@@ -169,12 +154,13 @@ def in_world(pixels: Array, world_from_pixel: Array) -> Array:
     return rigid.apply(world_from_pixel, np.column_stack([pixels, np.zeros(len(pixels))]))
 
 
-def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array:
+def _first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array:
     """The first echo of each column that has one : (n, 2) px u, v, to half a pixel.
 
     `contrast` is in grey levels, above the column's background; rows above `top` are left out.
     """
-    smooth = cv2.GaussianBlur(level, (0, 0), SMOOTH_PX, borderType=cv2.BORDER_REPLICATE)[top:]
+    smooth_px = 1.0  # before the first echo of each column is looked for
+    smooth = cv2.GaussianBlur(level, (0, 0), smooth_px, borderType=cv2.BORDER_REPLICATE)[top:]
     background = np.median(smooth, axis=1, keepdims=True)  # rows bright along the whole array are no wall
     bright = smooth - background > contrast
     peak = bright & (smooth >= np.roll(smooth, -1, axis=0)) & (smooth >= np.roll(smooth, 1, axis=0))
@@ -185,9 +171,11 @@ def first_echoes(level: NDArray[np.float32], top: int, contrast: float) -> Array
 
 def _rough_circle(points: Array, diameter: tuple[float, float]) -> tuple[Array, NDArray[np.bool_] | None]:
     """Circle x, y, radius with most of the points on its front side, and these points; None without one of the size."""
-    rng = np.random.default_rng(SEED)
+    seed = 0  # of the trials: the same image gives the same ring
+    rng = np.random.default_rng(seed)
     best, chosen, count = np.zeros(3), None, 9
-    for _ in range(TRIALS):
+    trials = 400  # circles through three first echoes
+    for _ in range(trials):
         three = points[rng.choice(len(points), 3, replace=False)]
         circle = _algebraic(three)
         if circle is None or not diameter[0] <= 2 * circle[2] <= diameter[1]:
@@ -204,7 +192,8 @@ def _rough_circle(points: Array, diameter: tuple[float, float]) -> tuple[Array, 
 
 def _on_front(points: Array, circle: Array) -> NDArray[np.bool_]:
     away = points - circle[:2]
-    return (np.abs(np.hypot(*away.T) - circle[2]) < NEAR_MM) & (away[:, 1] < NEAR_MM)
+    near_mm = 0.5  # from a circle, of the first echoes that count for it
+    return (np.abs(np.hypot(*away.T) - circle[2]) < near_mm) & (away[:, 1] < near_mm)
 
 
 def _algebraic(points: Array) -> Array | None:
@@ -216,24 +205,31 @@ def _algebraic(points: Array) -> Array | None:
 
 def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: Appearance, grey: float) -> Ring:
     """Edges along rays from the rough centre, less those off a smooth outline, with their scatter about it."""
-    angle = np.deg2rad(np.arange(-HALF_ARC_DEG, HALF_ARC_DEG + STEP_DEG / 2, STEP_DEG))
+    step_deg = 1.0  # between rays
+    half_arc_deg = 85.0  # of rays, on either side of the wall's front
+    angle = np.deg2rad(np.arange(-half_arc_deg, half_arc_deg + step_deg / 2, step_deg))
     rays = np.column_stack([np.sin(angle), -np.cos(angle)])
-    window = WINDOW_MM + WINDOW_SPREADS * look.spread_mm[0]
-    along = np.arange(max(circle[2] - window, 0.3 * circle[2]), circle[2] + window, SAMPLE_MM)
+    window_spreads = 3.0  # times the spread along the array
+    window_mm = 1.2  # along a ray, on either side of the rough circle, and
+    window = window_mm + window_spreads * look.spread_mm[0]
+    sample_mm = 0.02
+    along = np.arange(max(circle[2] - window, 0.3 * circle[2]), circle[2] + window, sample_mm)
     places = (circle[:2] + rays[:, None] * along[:, None]) / scale
     profiles = map_coordinates(level, [places[..., 1], places[..., 0]], order=1, mode="constant", cval=0.0)
     height, width = level.shape
     inside = ((places >= 0) & (places <= [width - 1, height - 1])).all(axis=(1, 2)) & (
         places[..., 1].min(axis=1) * scale[1] > 1.0
     )
-    middle, extent = _echo_middles(profiles, EDGE_DB * grey, look.min_contrast_db * grey)
+    edge_db = 10.0  # below the echo's top, where its two edges are taken
+    middle, extent = _echo_middles(profiles, edge_db * grey, look.min_contrast_db * grey)
     good = inside & np.isfinite(middle)
     if good.sum() < LEAST_EDGES:
         return _none(f"too few edges: {good.sum()} of {len(angle)} rays")
     angle, rays = angle[good], rays[good]
-    radius, extent = along[0] + SAMPLE_MM * middle[good], SAMPLE_MM * extent[good]
+    radius, extent = along[0] + sample_mm * middle[good], sample_mm * extent[good]
     outline, scatter = _smooth_outline(angle, radius, extent)
-    kept = np.abs(radius - outline) < OUTLIER * scatter * extent + FLOOR_MM
+    outlier = 3.5  # standard deviations from the smooth outline
+    kept = np.abs(radius - outline) < outlier * scatter * extent + FLOOR_MM
     if kept.sum() < LEAST_EDGES:
         return _none(f"too few edges: {kept.sum()} of {len(kept)} on a smooth outline")
     peaks = profiles[good][kept].max(axis=1)
@@ -243,7 +239,8 @@ def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: App
     growth = np.log(10) / 10 / grey * _slopes(angle, peaks) / radius  # of power, nepers a mm
     fading = growth * (wide - deep) * np.sin(angle) * np.cos(angle)
     radius = radius + bend + fading
-    sigma = np.sqrt((scatter * extent[kept]) ** 2 + FLOOR_MM**2 + (UNSURE * fading) ** 2)
+    unsure = 2.0  # times the correction for fading, which is its first order alone: standard deviation
+    sigma = np.sqrt((scatter * extent[kept]) ** 2 + FLOOR_MM**2 + (unsure * fading) ** 2)
     across = rays / scale  # px for 1 mm
     covariance = sigma[:, None, None] ** 2 * across[:, :, None] * across[:, None, :]
     return Ring((circle[:2] + radius[:, None] * rays) / scale, covariance)
@@ -272,11 +269,13 @@ def _slopes(angle: Array, peaks: Array) -> Array:
 
     Where levels are clipped the slope is taken to change evenly between both ends, as on the crest of a mirror's echo.
     """
-    known = peaks < CLIPPED
+    clipped = 250.0  # grey level of 255, from which an echo's brightness isn't known
+    known = peaks < clipped
     if known.sum() < LEAST_EDGES:
         return np.zeros_like(peaks)
     at, level = angle[known], peaks[known]
-    weight = np.exp(-0.5 * ((at[:, None] - at) / np.deg2rad(FADING_DEG)) ** 2)
+    fading_deg = 2.0  # sigma of the window in which the brightness' slope along the wall is taken
+    weight = np.exp(-0.5 * ((at[:, None] - at) / np.deg2rad(fading_deg)) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     away = at - (weight @ at)[:, None]
     return np.interp(angle, at, (weight * away) @ level / np.maximum((weight * away**2).sum(axis=1), 1e-12))
@@ -313,9 +312,10 @@ def _weighted(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tu
     begin = np.array([0, 0, 0, 0, start.radius])
     normal = away(begin)[1]
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, covariance, normal) + FLOOR_MM**2)
-    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=ROBUST)
+    robust = 3.0  # standard deviations, from which a point counts less in the cylinder's fit
+    result = least_squares(lambda p: away(p)[0] / sigma, begin, x_scale="jac", loss="soft_l1", f_scale=robust)
     bread = np.linalg.inv(result.jac.T @ result.jac)
-    gradients = _gradients(result.jac, result.fun, ROBUST)
+    gradients = _gradients(result.jac, result.fun, robust)
     scores = np.stack([gradients[frames == k].sum(axis=0) for k in np.unique(frames)])
     variance = bread @ (scores.T @ scores) @ bread * len(scores) / max(len(scores) - 1, 1)
     axis = start.axis + result.x[2:4] @ across

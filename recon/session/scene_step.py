@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from recon.capture import calibration_files, sweep_part
 from recon.capture.images import read_grey
 from recon.errors import Implausible, InputError
-from recon.files import atomic, layers, metrics
+from recon.files import atomic, meshes, metrics
 from recon.files.volumes import read_volume
 from recon.freehand import scans as freehand_scans
 from recon.fusion import fused_scene, scene_page, skin, slicer_folder
@@ -84,7 +84,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         scene = read(settings)
         made = fused_scene.layers(scene, settings.scans)
     with watch.busy("writing"), atomic.new_folder(out, BY) as folder:
-        layers.write_layers(folder / SCENE, made)
+        meshes.write_layers(folder / SCENE, made)
         scene_page.write(folder / PAGE, scene, settings.capture.resolve().name)
         slicer_folder.write(folder / SLICER, scene, voxels, settings.scans)
         counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made), "masses": len(scene.masses)}

@@ -13,18 +13,16 @@ from recon.skin_projection import skin_curve
 from recon.skin_projection.projector_image import Lines
 from recon.skin_projection.skin_curve import SkinCurve
 
-SCHEMA = "sonotwin-curves/1"
-ABOVE_MM = 0.2  # the skin, so that strips don't sink into it
-DIGITS = 4  # of mm
-
 
 def write_json(path: Path, curves: Sequence[SkinCurve]) -> None:
     """Write points of curves in mm of the world, a list for each piece that lies on the skin; whole or not at all."""
+    digits = 4  # of mm
     listed = [
-        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, DIGITS).tolist() for piece in pieces(curve.points)]}
+        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, digits).tolist() for piece in pieces(curve.points)]}
         for curve in curves
     ]
-    content = {"schema": SCHEMA, "unit": "mm", "frame": "camera 1", "curves": listed}
+    schema = "sonotwin-curves/1"
+    content = {"schema": schema, "unit": "mm", "frame": "camera 1", "curves": listed}
     with atomic.new_file(path) as temporary:
         temporary.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
@@ -38,7 +36,8 @@ def write_ply(path: Path, curves: Sequence[SkinCurve], lines: Lines) -> None:
 
 def strips(curves: Sequence[SkinCurve], lines: Lines) -> dict[str, trimesh.Trimesh]:
     """Strips by the curves' names, of those that have any piece."""
-    made = {curve.name: skin_curve.strip(curve, lines.of(curve).width_mm, ABOVE_MM) for curve in curves}
+    above_mm = 0.2  # the skin, so that strips don't sink into it
+    made = {curve.name: skin_curve.strip(curve, lines.of(curve).width_mm, above_mm) for curve in curves}
     return {name: strip for name, strip in made.items() if len(strip.faces)}
 
 

@@ -20,12 +20,6 @@ from recon.skin_projection.skin_curve import SkinCurve
 
 Array = NDArray[np.float64]
 
-FINEST_MM = 0.05  # of the grid
-MOST_CELLS = 600  # of it along an axis, for large masses
-SMOOTHING = 1.5  # cells; moves a border of radius r inwards by (1.5 * 0.05 mm)^2 / 2r, 0.001 mm at 3 mm
-MARGIN = 8  # cells around
-PATCHES = 4  # of skin, each about the normal of the one before
-
 
 def outlines(
     masses: Mapping[str, trimesh.Trimesh], skin: trimesh.Trimesh, eye_mm: ArrayLike | None = None
@@ -83,7 +77,8 @@ def normal_over(points: ArrayLike, skin: trimesh.Trimesh) -> Array:
     behind = np.einsum("ij,ij->i", away + middle, normals) > 0  # as the winding of another program may have them
     normals = np.where(behind[:, None], -normals, normals)
     normal = normals[distance[around].argmin()]
-    for _ in range(PATCHES):
+    patches = 4  # of skin, each about the normal of the one before
+    for _ in range(patches):
         height = away @ normal
         patch = (height > -reach) & (np.linalg.norm(away - height[:, None] * normal, axis=1) <= reach)
         if not patch.any():  # no skin over them: what is nearest will do
@@ -103,12 +98,16 @@ def outline(mass: trimesh.Trimesh, sight: Sight) -> Array:
     """
     places = sight.chart(mass.vertices)[:, :2]
     low, high = places.min(axis=0), places.max(axis=0)
-    pitch = max(FINEST_MM, float((high - low).max()) / MOST_CELLS)
-    columns, rows = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * MARGIN).tolist()
-    first = low - MARGIN * pitch
+    finest_mm = 0.05  # of the grid
+    most_cells = 600  # of it along an axis, for large masses
+    pitch = max(finest_mm, float((high - low).max()) / most_cells)
+    margin = 8  # cells around
+    columns, rows = (np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin).tolist()
+    first = low - margin * pitch
     grid = first + pitch * np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2)
     region = covered(sight, grid, mass).reshape(rows, columns)
-    borders = find_contours(gaussian_filter(region.astype(np.float32), SMOOTHING), 0.5)
+    smoothing = 1.5  # cells; moves a border of radius r inwards by (1.5 * 0.05 mm)^2 / 2r, 0.001 mm at 3 mm
+    borders = find_contours(gaussian_filter(region.astype(np.float32), smoothing), 0.5)
     if not borders:
         raise InputError(f"masses: expected closed bodies, found one of {(high - low).max():.2g} mm that no line of sight meets")
     outer = max(borders, key=lambda border: abs(_area(border)))

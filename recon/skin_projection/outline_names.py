@@ -21,7 +21,6 @@ from recon.skin_projection.skin_curve import SkinCurve
 Array = NDArray[np.float64]
 
 FONT = FontProperties("DejaVu Sans")  # which comes with matplotlib, so that a name looks alike everywhere
-CAPITAL = 0.729  # height of the font's capitals, of its size
 GAP = 0.5  # between a name and any curve, of the capitals' height
 FARTHER = (1.0, 2.5, 4.0)  # gaps from the outline that are tried, as multiples of that
 ROUND = np.array([[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]])  # sides, over the outline first
@@ -73,7 +72,8 @@ def title(mass: str) -> str:
 
 def letters(name: str, height_mm: float) -> list[Array]:
     """Closed contours : (n, 2) mm, to the right and down, of a name about its middle, with capitals of a height."""
-    scale = height_mm / CAPITAL / text_to_path.FONT_SCALE
+    capital = 0.729  # height of the font's capitals, of its size
+    scale = height_mm / capital / text_to_path.FONT_SCALE
     path = Path(*text_to_path.get_text_path(FONT, name))
     contours = [scale * polygon * [1, -1] for polygon in path.to_polygons()]
     if not contours:

@@ -22,8 +22,6 @@ Array = NDArray[np.float64]
 
 LPS_FROM = {"LPS": np.ones(3), "RAS": np.array([-1.0, -1.0, 1.0])}
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # mm: nothing of the rig is farther away than ten metres
-LEAST_MM = 1e-3  # between two control points; nearer ones are one
-FINE = 20  # points of a spline from one control point to the next
 
 
 class ControlPoint(BaseModel):
@@ -61,12 +59,13 @@ def read(path: Path) -> list[Array]:
     """
     content = validated(Markups, json_text.read(path, "a curve of 3D Slicer, .mrk.json"), path)
     chains = []
+    least_mm = 1e-3  # between two control points; nearer ones are one
     for number, markup in enumerate(content.markups):
         defined = [point.position for point in markup.controlPoints if point.positionStatus == "defined"]
         points = LPS_FROM[markup.coordinateSystem] * np.reshape(defined, (-1, 3))
         if markup.type == "ClosedCurve":
             points = np.concatenate([points, points[:1]])
-        if len(points) < 2 or not np.linalg.norm(np.diff(points, axis=0), axis=1).min() > LEAST_MM:
+        if len(points) < 2 or not np.linalg.norm(np.diff(points, axis=0), axis=1).min() > least_mm:
             raise InputError(f"{path}: markups.{number}: expected control points in two places or more, found some in one place")
         chains.append(points if markup.type == "Line" else _spline(points, markup.type == "ClosedCurve"))
     return chains
@@ -92,4 +91,5 @@ def _spline(points: Array, closed: bool) -> Array:
     """A cubic spline over the chords' lengths through points : (n, 3)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     spline = CubicSpline(along, points, bc_type="periodic" if closed else "natural")
-    return spline(np.interp(np.arange((len(points) - 1) * FINE + 1) / FINE, np.arange(len(points)), along))
+    fine = 20  # points of a spline from one control point to the next
+    return spline(np.interp(np.arange((len(points) - 1) * fine + 1) / fine, np.arange(len(points)), along))

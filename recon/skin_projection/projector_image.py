@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon.files import meshes
 from recon.geometry.camera import Camera
 from recon.skin_projection import skin_curve
 from recon.skin_projection.lines_of_sight import Sight, first_hits
@@ -22,10 +23,9 @@ from recon.skin_projection.skin_curve import SkinCurve
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Length = Annotated[float, Field(ge=0.5, le=100)]
-
 FINE = 8  # parts of a pixel along each axis, by which its coverage is counted
-SHIFT = 4  # binary digits behind the point, of corners for OpenCV
-HIDDEN_MM = 0.5  # that something stands before a point of the skin, to hide it: far above the noise of a surface
+Lit = Mapping[str, NDArray[np.bool_]]  # whether light reaches a curve's points : (n,), by its name
+MARGIN_MM = 3.0  # around the body: more than it moves by hand between two images of a projector
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,6 @@ class Lines:
 
 
 USUAL = Lines()
-
-
-Lit = Mapping[str, NDArray[np.bool_]]  # whether light reaches a curve's points : (n,), by its name
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +125,8 @@ def visible(points: Array, skin: trimesh.Trimesh, device: Camera) -> NDArray[np.
     sight = Sight.of_device(device)
     hits = first_hits(sight, np.where(within[:, None], sight.chart(points)[:, :2], np.nan), skin).points
     before = np.linalg.norm(points - device.centre, axis=1) - np.linalg.norm(hits - device.centre, axis=1)
-    return within & ~(before > HIDDEN_MM)
+    hidden_mm = 0.5  # that something stands before a point of the skin, to hide it: far above the noise of a surface
+    return within & ~(before > hidden_mm)
 
 
 def quadrilaterals(curve: SkinCurve, width_mm: float, device: Camera) -> Array:
@@ -148,8 +146,45 @@ def coverage(corners: Array, size: tuple[int, int]) -> NDArray[np.float32]:
     columns, rows = (high - low + 1).tolist()
     fine = np.zeros((rows * FINE, columns * FINE), np.uint8)
     inner = (corners - low + 0.5) * FINE - 0.5
-    for corner in np.rint(inner * 2**SHIFT).astype(np.int32):
-        cv2.fillConvexPoly(fine, corner, 255, shift=SHIFT)
+    shift = 4  # binary digits behind the point, of corners for OpenCV
+    for corner in np.rint(inner * 2**shift).astype(np.int32):
+        cv2.fillConvexPoly(fine, corner, 255, shift=shift)
     share = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
     result[low[1] : high[1] + 1, low[0] : high[0] + 1] = share.astype(np.float32) / 255
     return result
+
+
+def expected_view(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, camera: Camera, lines: Lines) -> Image:
+    """Grey view : (h, w) of the skin's vertices, in their own grey where they carry one, and of what is lit of the curves."""
+    width, height = camera.size
+    view = np.zeros((height, width), np.uint8)
+    pixels = np.rint(camera.project(np.asarray(skin.vertices)))
+    within = ((pixels >= 0) & (pixels < [width, height])).all(axis=1)
+    u, v = pixels[within].astype(int).T
+    greys = meshes.greys_of(skin)
+    dimmed = 0.5  # of the skin's grey, so that lines stand out
+    plain = 128  # grey of a skin that carries none
+    view[v, u] = dimmed * (plain if greys is None else greys[within])
+    filled = np.where(view == 0, cv2.dilate(view, np.ones((3, 3), np.uint8)), view)  # between vertices that are farther apart
+    seen = in_sight(curves, skin, camera)
+    both = {name: points & seen[name] for name, points in lit.items()}
+    drawn = strips_of_light(curves, both, camera, lines)
+    return np.maximum(filled, np.uint8(np.rint(255 * drawn)))
+
+
+def probe_shadow(body: trimesh.Trimesh, projector: Camera, margin_mm: float = MARGIN_MM) -> NDArray[np.bool_]:
+    """Whether pixels : (h, w) of a projector see a body, such as `recon.fusion.probe_shape.of` moved by its pose, or its margin.
+
+    Left dark, no line climbs over the probe, where it would mislead, and none crosses the target's circles, which the cameras
+    track. A body that is partly behind the projector hides what its triangles before it hide.
+    """
+    width, height = projector.size
+    covered, vertices = np.zeros((height, width), np.uint8), np.asarray(body.vertices)
+    corners = projector.project(vertices)[body.faces]
+    near = np.abs(corners).max(axis=(1, 2)) < 8 * max(width, height)  # farther ones would overflow, and false if not finite
+    for corner in np.rint(corners[near]).astype(np.int32):
+        cv2.fillConvexPoly(covered, corner, 1)
+    distance = float(np.median(np.linalg.norm(vertices - projector.centre, axis=1)))
+    reach = int(np.ceil(margin_mm * projector.matrix[0, 0] / distance))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return cv2.dilate(covered, disc).astype(bool)

@@ -23,14 +23,7 @@ Array = NDArray[np.float64]
 VERTICES = 60_000  # of a skin, evenly chosen
 PATCH = 40  # of them in a patch: some 3 mm about its middle, on a breast
 OVERLAP = 3  # patches that a vertex is in
-ONE_SIDED = 0.3  # of a patch's radius, that its middle is off the vertex about which it lies: it lies at the rim
-ROUNDS = 60
-FIRST_MM, LAST_MM = 15.0, 4.0  # farthest pair, at first and at last
-WIDTHS = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % efficient for normal errors
 SETTLED = np.array([1e-7] * 3 + [1e-5] * 3)  # step, rad and mm, after which it is done
-LEAST_SHARE = 0.4  # of the patches with a partner
-LEAST_TURN = 0.8  # cosine between the normals of partners
-LEAST_SLACK = 1e-9  # see `slack`: less is a plane or another shape without any noise, whose equations have no solution
 APART = PATCH // OVERLAP  # vertices from the middle of a patch to that of the next
 # Variance of Tukey's estimate over `variance * inv(squares)`, of normal errors: E[(w r)^2] / E[d(w r)/dr]^2 = 1.053 by 0.905 of
 # E[w r^2] / E[w]^2 [Huber 1981, 7.6].
@@ -72,28 +65,34 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
         If too little of the old skin lies on the new one, or its shape leaves the motion open, as a plane's does.
     """
     before, after = patches(old), patches(new)
-    if not len(after.middles) or slack(before) < LEAST_SLACK:
+    least_slack = 1e-9  # see `slack`: less is a plane or another shape without any noise, whose equations have no solution
+    if not len(after.middles) or slack(before) < least_slack:
         raise InputError("skin: expected one that is bent in all directions, found one that slides in itself: measure more of it")
-    tree, pose, reach = surface_tree(after.middles), np.eye(4), FIRST_MM
-    for _ in range(ROUNDS):
+    first_mm, last_mm = 15.0, 4.0  # farthest pair, at first and at last
+    tree, pose, reach = surface_tree(after.middles), np.eye(4), first_mm
+    widths = 4.685  # robust standard deviations at which Tukey's weight ends, 95 % efficient for normal errors
+    least_turn = 0.8  # cosine between the normals of partners
+    rounds = 60
+    least_share = 0.4  # of the patches with a partner
+    for _ in range(rounds):
         moved, turned = rigid.apply(pose, before.middles), rigid.rotate(pose, before.normals)
         distance, nearest = tree.query(moved)
         others = after.normals[nearest]
-        paired = (distance < reach) & ((others * turned).sum(axis=1) > LEAST_TURN)
+        paired = (distance < reach) & ((others * turned).sum(axis=1) > least_turn)
         share = float(paired.mean())
-        if share < LEAST_SHARE:
+        if share < least_share:
             raise InputError(
-                f"skin: expected the earlier skin, moved by up to {FIRST_MM:g} mm, found {share:.0%} of it on the new one: "
+                f"skin: expected the earlier skin, moved by up to {first_mm:g} mm, found {share:.0%} of it on the new one: "
                 "is it another body, or did it move farther? then find the masses anew"
             )
         between = (turned + others)[paired] / 2
         off = ((after.middles[nearest] - moved)[paired] * between).sum(axis=1)
         slopes = np.column_stack([np.cross(rigid.rotate(pose, before.middles[paired]), between), between])
         scale = max(1.4826 * float(np.median(np.abs(off))), 1e-6)
-        weights = np.maximum(1 - (off / (WIDTHS * scale)) ** 2, 0) ** 2
+        weights = np.maximum(1 - (off / (widths * scale)) ** 2, 0) ** 2
         squares = slopes.T @ (weights[:, None] * slopes)
         change = np.linalg.solve(squares, slopes.T @ (weights * off))
-        pose, reach = rigid.moved(pose, change), max(reach / 2, LAST_MM)
+        pose, reach = rigid.moved(pose, change), max(reach / 2, last_mm)
         if (np.abs(change) < SETTLED).all():
             break
     variance = float((weights * off**2).sum() / max(weights.sum() - 6, 1))
@@ -124,5 +123,6 @@ def patches(skin: trimesh.Trimesh) -> Patches:
     planes *= np.where((planes * normals[chosen]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     aside = middles - vertices[chosen]
     aside -= (aside * planes).sum(axis=1)[:, None] * planes
-    whole = np.linalg.norm(aside, axis=1) < ONE_SIDED * radius
+    one_sided = 0.3  # of a patch's radius, that its middle is off the vertex about which it lies: it lies at the rim
+    whole = np.linalg.norm(aside, axis=1) < one_sided * radius
     return Patches(middles[whole], planes[whole])

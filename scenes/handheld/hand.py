@@ -16,7 +16,6 @@ from scenes.handheld.mesh_parts import Part
 Array = NDArray[np.float64]
 
 VOXEL_MM = 3.5  # some 13 000 triangles a hand
-REACH_MM = 14.0  # how far from a capsule its distance matters to the smooth minimum
 SEGMENTS_MM = np.array([[46, 27, 22], [50, 31, 23], [46, 28, 23], [36, 21, 20]], float)  # index to little finger of an adult
 RADII_MM = np.array([9.2, 9.4, 8.8, 7.8])  # of the fingers at their roots
 THUMB_MM = np.array([34.0, 28.0])
@@ -175,9 +174,10 @@ def skin(hand: Skeleton, arm_mm: float, voxel: float = VOXEL_MM) -> trimesh.Trim
     low = np.min([np.minimum(b.start, b.end) - max(b.radii) for b in hand.bones], axis=0) - 2 * voxel
     high = np.max([np.maximum(b.start, b.end) + max(b.radii) for b in hand.bones], axis=0) + 2 * voxel
     shape = np.ceil((high - low) / voxel).astype(int) + 1
-    field = np.full(shape, REACH_MM, np.float32)
+    reach_mm = 14.0  # how far from a capsule its distance matters to the smooth minimum
+    field = np.full(shape, reach_mm, np.float32)
     for bone in hand.bones:
-        margin = max(bone.radii) + REACH_MM
+        margin = max(bone.radii) + reach_mm
         first = np.maximum(np.floor((np.minimum(bone.start, bone.end) - margin - low) / voxel).astype(int), 0)
         last = np.minimum(np.ceil((np.maximum(bone.start, bone.end) + margin - low) / voxel).astype(int) + 1, shape)
         here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
@@ -189,10 +189,10 @@ def skin(hand: Skeleton, arm_mm: float, voxel: float = VOXEL_MM) -> trimesh.Trim
         hand_mesh = trimesh.Trimesh(hand_mesh.vertices, faces[:, ::-1], process=False)
     if arm_mm <= STUMP_MM:
         return hand_mesh
-    return lofts.joined([hand_mesh, cuff(hand, STUMP_MM - 25, arm_mm, 0.3)])
+    return lofts.joined([hand_mesh, _cuff(hand, STUMP_MM - 25, arm_mm, 0.3)])
 
 
-def cuff(hand: Skeleton, start_mm: float, end_mm: float, thick_mm: float) -> trimesh.Trimesh:
+def _cuff(hand: Skeleton, start_mm: float, end_mm: float, thick_mm: float) -> trimesh.Trimesh:
     """A closed tube about the forearm from `start_mm` to `end_mm` beyond the wrist: bare arm, sleeve, glove or watch strap."""
     edge = min(0.3 * (end_mm - start_mm), max(thick_mm, 0.4))
     middle = np.linspace(start_mm + edge, end_mm - edge, max(4, int((end_mm - start_mm) / 12)))
@@ -220,11 +220,11 @@ def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
     if kind == "sleeve":
         start = rng.uniform(5, 110)
         bare = start + 40
-        cloth = cuff(skeleton, start, rng.uniform(280, 380), rng.uniform(3, 9))
+        cloth = _cuff(skeleton, start, rng.uniform(280, 380), rng.uniform(3, 9))
     elif kind == "watch":
         start, bare = rng.uniform(8, 22), rng.uniform(280, 380)
         wide = rng.uniform(16, 30)
-        strap = cuff(skeleton, start, start + wide, rng.uniform(1.2, 2.5))
+        strap = _cuff(skeleton, start, start + wide, rng.uniform(1.2, 2.5))
         side = np.cross(skeleton.forearm, skeleton.broad) * rng.choice([-1, 1])
         spot = skeleton.wrist + (start + wide / 2) * skeleton.forearm + 21 * skeleton.size * side
         face = lofts.prism(lofts.superellipse((18, 18), rng.choice([2, 5]), 32), 9, 1)
@@ -232,7 +232,7 @@ def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
         cloth = lofts.joined([strap, face])
     elif kind == "glove":
         start, bare = rng.uniform(0, 15), rng.uniform(280, 380)
-        cloth = cuff(skeleton, start, start + rng.uniform(40, 90), rng.uniform(1.5, 4))
+        cloth = _cuff(skeleton, start, start + rng.uniform(40, 90), rng.uniform(1.5, 4))
     else:
         return [Part("skin", skin(skeleton, rng.uniform(280, 380)), True)]
     return [Part("skin", skin(skeleton, bare), True), Part("sleeve", cloth, True)]

@@ -23,10 +23,7 @@ from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, d
 
 Array = NDArray[np.float64]
 
-TRIES = 40  # of a housing that stands clear of the board
 BEHIND_MM = 1e-3  # from the board's middle: a probe behind it is beside it in no direction
-GRIPS = 160  # of a hand that leaves the circles free
-ANY_GRIP = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too
 IMAGE_FROM_BODY = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the body's z is against the image's depth
 
 
@@ -101,14 +98,17 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
     def in_the_way(balls: Array) -> bool:
         return pierces(balls, board) or any(hides(balls, eye, discs, target.outer_diameter_mm / 2) for eye in eyes)
 
-    parts += grip(holder_rng, housing, target_from_body, beside, in_the_way, ANY_GRIP, GRIPS)
+    grips = 160  # of a hand that leaves the circles free
+    any_grip = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too
+    parts += grip(holder_rng, housing, target_from_body, beside, in_the_way, any_grip, grips)
     parts += _cable(cable_rng, housing, target_from_body, beside, None, target.outer_diameter_mm / 2)
     return tuple(parts)
 
 
 def _clear_of(board: Board, rng: np.random.Generator, target_from_body: Array, array_mm: float) -> Body:
     """A housing for an array that doesn't pierce the board; InputError if none is found."""
-    for _ in range(TRIES):
+    tries = 40  # of a housing that stands clear of the board
+    for _ in range(tries):
         housing = scaled(body(rng), array_mm)
         levels = np.linspace(0, 1, 40)
         rings = np.concatenate([housing.outline_at(level) + np.array([0, 0, level * housing.length]) for level in levels])

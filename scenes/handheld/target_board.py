@@ -14,10 +14,7 @@ from scenes.handheld.mesh_parts import Part
 
 Array = NDArray[np.float64]
 
-MARGIN_MM = 3.0  # of white around each disc, at least
-SHEET_MM = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
 CLEAR_MM = 1.0  # between a disc and what is not to cover it
-SOFT = 0.6  # of a finger's radius: what gives way where it is pressed against the board
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,8 @@ def draw_front(rng: np.random.Generator, target: Target, spread: float) -> tuple
 
     spread : largest relative change of each side.
     """
-    room = target.outer_diameter_mm / 2 + MARGIN_MM
+    margin_mm = 3.0  # of white around each disc, at least
+    room = target.outer_diameter_mm / 2 + margin_mm
     needed_low, needed_high = -room * np.ones(2), circle_layout.extent(target) + room
     size = np.maximum(np.array(target.board_mm) * rng.uniform(1 - spread, 1 + spread, 2), needed_high - needed_low)
     low = needed_high - size + rng.beta(1.5, 1.5, 2) * (needed_low - needed_high + size)
@@ -58,7 +56,8 @@ def build_board(rng: np.random.Generator, low: Array, high: Array, thickness_mm:
     x, y = np.array([low[0], high[0], high[0], low[0]]), np.array([low[1], low[1], high[1], high[1]])
     front = trimesh.Trimesh(np.column_stack([x, y, np.zeros(4)]), [[0, 1, 2], [0, 2, 3]], process=False)
     middle = np.append((low + high) / 2, 0)
-    solid = lofts.box([*size, thickness - SHEET_MM], middle - [0, 0, (thickness + SHEET_MM) / 2])
+    sheet_mm = 0.05  # the print lies this far in front of the board's body, so that no two surfaces coincide
+    solid = lofts.box([*size, thickness - sheet_mm], middle - [0, 0, (thickness + sheet_mm) / 2])
     parts = [Part("target", front, False), Part("board", solid, False)]
     total = thickness
     if rng.uniform() < 0.45:
@@ -104,4 +103,5 @@ def pierces(points: Array, board: Board) -> bool:
     """Whether any ball : (n, 4) of x, y, z, radius touches the board."""
     low, high = np.array([*board.low, -board.thickness]), np.array([*board.high, 0.0])
     away = np.maximum(np.maximum(low - points[:, :3], points[:, :3] - high), 0)
-    return bool((np.linalg.norm(away, axis=1) < SOFT * points[:, 3]).any())
+    soft = 0.6  # of a finger's radius: what gives way where it is pressed against the board
+    return bool((np.linalg.norm(away, axis=1) < soft * points[:, 3]).any())

@@ -22,7 +22,6 @@ Array = rigid.Array
 
 SIDES = 256  # of a disc's outline: a radius of 4.5 mm is met within 0.0004 mm
 CELL_MM = 4.0  # of the ground's triangles, small enough to follow a warp
-THICKNESS_MM = 3.0
 MAX_ERRORS = 4  # standard deviations that a print error reaches in x and in y; room for them is kept between circles
 
 
@@ -118,10 +117,11 @@ def things(config: Config) -> tuple[Thing, Thing]:
     """Ground and discs in the board's frame."""
     points, triangles, black = _print(config)
     parts = []
+    thickness_mm = 3.0
     for name, chosen, reflectance in (("ground", ~black, config.white), ("discs", black, config.black)):
         used, faces = np.unique(triangles[chosen], return_inverse=True)
         part = points[used]
-        mesh = solid_meshes.slab(part, faces.reshape(-1, 3), THICKNESS_MM, _heights(config, part))
+        mesh = solid_meshes.slab(part, faces.reshape(-1, 3), thickness_mm, _heights(config, part))
         parts.append(Thing(name, mesh, Material(reflectance, config.roughness), smooth=False))
     return parts[0], parts[1]
 

@@ -26,8 +26,6 @@ MADE_OF = {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"}
 
 Array = rigid.Array
 
-APART_MM = 1.0  # of tissue between two tumours
-
 
 class Tumour(Part):
     """One tumour: its greatest extent, and where its middle lies in the phantom's frame (z up from the base)."""
@@ -167,10 +165,11 @@ def _check_depth(k: int, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> 
 
 def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
     """Refuse tumour k if it comes nearer than `APART_MM` to an earlier one, or one lies within the other."""
+    apart_mm = 1.0  # of tissue between two tumours
     for other in range(k):
         gap = -max(_depth(masses[k].vertices, masses[other]).max(), _depth(masses[other].vertices, masses[k]).max())
-        if gap < APART_MM:
-            raise InputError(f"tumours.{k}: expected at least {APART_MM:g} mm from tumours.{other}, found {gap:.2f} mm")
+        if gap < apart_mm:
+            raise InputError(f"tumours.{k}: expected at least {apart_mm:g} mm from tumours.{other}, found {gap:.2f} mm")
 
 
 def _depth(points: Array, surface: trimesh.Trimesh) -> Array:

@@ -10,8 +10,6 @@ from scenes.scene_types import Material, Scene, Thing
 
 MADE_OF = {"": "water", "tank": "polymer"}  # for ultrasound; see `scenes.acoustics`
 
-THICKNESS_MM = 10.0
-
 
 class Config(Part):
     """A flat plate under water; the water's surface is left out, for no instrument of the twin looks through it."""
@@ -30,5 +28,6 @@ def build(config: Config) -> Scene:
 
 def bottom(depth_mm: float, middle_mm: tuple[float, float], size_mm: tuple[float, float], reflectance: float) -> Thing:
     """A tank's bottom: a plate whose upper face lies at z = depth_mm."""
-    plate = solid_meshes.moved(solid_meshes.plate(size_mm, THICKNESS_MM), rigid.transform(np.eye(3), (*middle_mm, depth_mm)))
+    thickness_mm = 10.0
+    plate = solid_meshes.moved(solid_meshes.plate(size_mm, thickness_mm), rigid.transform(np.eye(3), (*middle_mm, depth_mm)))
     return Thing("tank", plate, Material(reflectance), smooth=False)

@@ -20,9 +20,6 @@ Step = Annotated[float, Field(ge=5, le=80)]
 
 TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
 GAP_MM = 8.0  # between plate and box: the box's shadow falls on the plate with nothing to lead unwrapping across
-PLATE = ((-25.0, 0.0), (170.0, 180.0))  # middle and size in x, y, mm; crosses the projector's centre column, near x = 0
-BOX = ((-5.0, -4.0), (60.0, 90.0))
-BLOCK = ((-82.0, 20.0), (34.0, 80.0))
 SPHERE = (93.0, -12.0)  # middle in x, y, mm; right of the plate, off the centre column
 
 
@@ -41,10 +38,13 @@ def build(config: Config) -> Scene:
     """Plate, box, block and sphere, with the planes of the three fronts and the sphere."""
     box_z, block_z = config.plate_mm - config.box_step_mm, config.plate_mm - config.block_step_mm
     centre = np.array([*SPHERE, config.plate_mm - config.sphere_step_mm])
+    plate = ((-25.0, 0.0), (170.0, 180.0))  # middle and size in x, y, mm; crosses the projector's centre column, near x = 0
+    box = ((-5.0, -4.0), (60.0, 90.0))
+    block = ((-82.0, 20.0), (34.0, 80.0))
     fronts = (
-        ("plate", PLATE, config.plate_mm, 5.0),
-        ("box", BOX, box_z, config.box_step_mm - GAP_MM),
-        ("block", BLOCK, block_z, config.block_step_mm),
+        ("plate", plate, config.plate_mm, 5.0),
+        ("box", box, box_z, config.box_step_mm - GAP_MM),
+        ("block", block, block_z, config.block_step_mm),
     )
     sphere = Sphere("sphere", centre, config.sphere_radius_mm)
     ball = solid_meshes.moved(solid_meshes.ball(config.sphere_radius_mm), rigid.transform(np.eye(3), centre))

@@ -32,12 +32,10 @@ from recon.model.rig import Part, Positive
 from recon.model.tracks import LagSeconds
 from recon.navigation import mass_distances, still_scene
 from recon.navigation.browser_view import LOOPBACK, BrowserView
-from recon.navigation.exposure_clock import FollowedClock
-from recon.navigation.feeds import Device
-from recon.navigation.igtl_sender import IgtlSender
+from recon.navigation.feeds import Device, FollowedClock
 from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.publishing import Publisher, StillScene
-from recon.navigation.slicer_publisher import SlicerPublisher
+from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
 from recon.session.settings import MeasuredTargetFields, make_tracker, target_of

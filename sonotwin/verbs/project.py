@@ -30,7 +30,7 @@ from rich.console import Console
 from recon.capture import calibration_files, sweep_part
 from recon.devices.interfaces import Projector
 from recon.errors import Implausible, InputError
-from recon.files import atomic, layers, metrics
+from recon.files import atomic, meshes, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import scans as freehand_scans
 from recon.fusion import fused_scene, probe_shape
@@ -43,11 +43,9 @@ from recon.registry import Choice
 from recon.segmentation import containment, mass_files
 from recon.skin_projection import (
     curve_files,
-    expected_view,
     mass_outline,
     outline_names,
     planned_cut,
-    probe_shadow,
     projector_image,
     scan_line,
     skin_registration,
@@ -97,7 +95,7 @@ class Config(Part):
     """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
     """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
-    margin_mm: NotNegative = probe_shadow.MARGIN_MM
+    margin_mm: NotNegative = projector_image.MARGIN_MM
     """mm around the probe and its target that stay dark, too"""
     names_mm: Annotated[float, Field(ge=0, le=50)] = 5.0
     """mm, height of the letters by which each mass is named beside its outline; 0 draws none"""
@@ -173,7 +171,7 @@ def draw(config: Config, console: Console) -> NDArray[np.uint8]:
     curves += [] if held is None else [held.line]
     if not curves:
         raise InputError(f"{config.masses}: expected masses to draw, found none in it; give a cut or a capture, too")
-    dark = None if held is None else probe_shadow.shadow(held.body, cameras["projector"], config.margin_mm)
+    dark = None if held is None else projector_image.probe_shadow(held.body, cameras["projector"], config.margin_mm)
     names = named(config, curves, masses, skin, cameras["projector"], dark)
     drawing = projector_image.draw([*curves, *names], skin, cameras["projector"], config.rig.projector.gamma, config.lines, dark)
     seconds = round(time.perf_counter() - start, 3)
@@ -328,14 +326,14 @@ def write(
     """Write all files but the figures; returns their names."""
     pictures = {PICTURE: drawing.image}
     if "cam1" in cameras:
-        pictures[EXPECTED] = expected_view.expected([*curves, *names], drawing.lit, skin, cameras["cam1"], lines)
+        pictures[EXPECTED] = projector_image.expected_view([*curves, *names], drawing.lit, skin, cameras["cam1"], lines)
     for name, image in pictures.items():
         (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
     curve_files.write_json(folder / CURVES, curves)
     curve_files.write_ply(folder / STRIPS, curves, lines)
     shown = {"skin": fused_scene.surface_layer(skin, fused_scene.SKIN, fused_scene.GREY_SKIN)}
-    shown |= {name: layers.painted(mass, fused_scene.MASS) for name, mass in masses.items()}
+    shown |= {name: meshes.painted(mass, fused_scene.MASS) for name, mass in masses.items()}
     strips = curve_files.strips([*curves, *names], lines)
-    shown |= {f"{name}_light": layers.painted(strip, LIGHT) for name, strip in strips.items()}
-    layers.write_layers(folder / SCENE, shown)
+    shown |= {f"{name}_light": meshes.painted(strip, LIGHT) for name, strip in strips.items()}
+    meshes.write_layers(folder / SCENE, shown)
     return [*pictures, CURVES, STRIPS, SCENE]

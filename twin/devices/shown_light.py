@@ -19,7 +19,7 @@ Pattern = NDArray[np.uint8]
 Profile = tuple[Axis, bool, NDArray[np.float32]]
 
 
-def profile_of(pattern: Pattern) -> Profile | None:
+def _profile_of(pattern: Pattern) -> Profile | None:
     """The profile of a pattern : (h, w) along the axis on which it varies; None if it varies along both.
 
     Black and white are the same by any gamma, so that all patterns may count as grey.
@@ -42,13 +42,13 @@ class KnownLight:
     @classmethod
     def of(cls, patterns: Sequence[Pattern], projector: ProjectorDevice) -> "KnownLight":
         """Of patterns : (h, w) each; those that vary along both axes can't be part of it."""
-        profiles = [profile for pattern in patterns if (profile := profile_of(pattern)) is not None]
+        profiles = [profile for pattern in patterns if (profile := _profile_of(pattern)) is not None]
         light = Light.of_profiles(projector.optics.size, profiles, projector)
         return cls(light, {_key(profile): k for k, profile in enumerate(profiles)}, projector)
 
     def find(self, pattern: Pattern) -> tuple[Light | ImageLight, int]:
         """The light that a pattern is part of, and its number therein; of an unknown one its own."""
-        profile = profile_of(pattern)
+        profile = _profile_of(pattern)
         if profile is None:
             return ImageLight.of(pattern, self.projector), 0
         place = self.places.get(_key(profile))

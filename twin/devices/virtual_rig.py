@@ -22,8 +22,6 @@ from twin.sensor import Exposure, expose
 
 TRANSFER_NS = 5_000_000  # from the end of an exposure until the image is in memory; assumed, of a camera at USB 3
 REFRESH_NS = 16_666_667  # of the projector's display, until a pattern is on as a whole
-FREE_NS = 33_333_333  # from frame to frame of a camera that runs free
-LONGEST_S, HIGHEST_GAIN = 10.0, 16.0  # that the virtual cameras can be set to
 
 
 class Still(Protocol):
@@ -90,8 +88,9 @@ class VirtualCamera:
 
     def set_exposure(self, exposure_s: float, gain: float) -> None:
         """Set exposure time and linear gain."""
-        if not (0 < exposure_s <= LONGEST_S and 0 < gain <= HIGHEST_GAIN):
-            limits = f"up to {LONGEST_S:g} s and a gain of {HIGHEST_GAIN:g}"
+        longest_s, highest_gain = 10.0, 16.0  # that the virtual cameras can be set to
+        if not (0 < exposure_s <= longest_s and 0 < gain <= highest_gain):
+            limits = f"up to {longest_s:g} s and a gain of {highest_gain:g}"
             raise DeviceError(f"{self.name}: expected an exposure of {limits}, found {exposure_s:g} s and {gain:g}")
         self._exposure = Exposure(exposure_s, gain, self._exposure.bits)
 
@@ -117,8 +116,9 @@ class VirtualCamera:
         """Wait for the next frame; None if none came in time."""
         if self._trigger is None:
             raise DeviceError(f"{self.name}: expected a camera that was started, found one at rest")
+        free_ns = 33_333_333  # from frame to frame of a camera that runs free
         if self._trigger == "free" and not self._exposed:
-            self._rig.clock.advance_to(self._rig.clock.now_ns + FREE_NS)
+            self._rig.clock.advance_to(self._rig.clock.now_ns + free_ns)
             self.expose_now()
         if self._trigger == "hardware" and not self._exposed:
             self._rig.refresh()

@@ -1,10 +1,11 @@
 """Virtual devices of a recording, with what stands before them and the hand that moves it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from recon.acquisition.guidance import Operator
+from recon.acquisition.guidance import Answer, Operator, Step
 from recon.errors import InputError
+from recon.geometry import rigid
 from recon.model.boards import AsymmetricCircles, Board
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
@@ -12,15 +13,12 @@ from scenes.kinds import board
 from twin.devices.shown_light import Pattern
 from twin.devices.still_scenes import HeldBoard, StillScene, known_to_board, known_to_scene
 from twin.devices.virtual_clock import Turns, VirtualClock
-from twin.devices.virtual_operator import BoardHand, OneTake
 from twin.devices.virtual_rig import VirtualCamera, VirtualProjector, VirtualRig
 from twin.devices.virtual_sweep import VirtualPair, VirtualScanner
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import CameraName
 from twin.tracking.sampling_ranges import DataRanges
-
-PATIENCE = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,8 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
         raise InputError("board.kind: expected asymmetric_circles, dark ones, as the twin prints no others, found another board")
     printed = board.Config(**design.model_dump(exclude={"kind", "white", "unusual"}))
     held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
-    return _devices(settings, held, BoardHand(held.hold, PATIENCE * count))
+    patience = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
+    return _devices(settings, held, BoardHand(held.hold, patience * count))
 
 
 def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:
@@ -79,3 +78,37 @@ def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = Fals
 def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: Operator) -> StillDevices:
     rig = VirtualRig(settings.rig, still, VirtualClock(settings.paced), settings.bits, settings.seed)
     return StillDevices({name: rig.camera(name) for name in settings.cameras}, rig.projector(), operator)
+
+
+class BoardHand:
+    """Holds the board where it is asked to, some times at most, and then ends."""
+
+    def __init__(self, hold: Callable[[rigid.Array], None], most: int) -> None:
+        self._hold, self._left = hold, most
+
+    def ask(self, step: Step) -> None:
+        """Hold the board."""
+        self._left -= 1
+        if step.world_from_board is not None:
+            self._hold(step.world_from_board)
+
+    def answer(self) -> Answer:
+        """`take`, or `end` after too many requests."""
+        return "end" if self._left < 0 else "take"
+
+
+class OneTake:
+    """Takes once, and keeps what came of it; of a sweep, ends when its path is over."""
+
+    def __init__(self, over: Callable[[], bool] = lambda: True) -> None:
+        self._over, self._asked = over, 0
+
+    def ask(self, step: Step) -> None:
+        """Count the requests: the first begins, a second one follows when it has been done."""
+        self._asked += 1
+
+    def answer(self) -> Answer:
+        """`take` at first, then `end` as soon as it is over."""
+        if self._asked < 2:
+            return "take"
+        return "end" if self._over() else "wait"

@@ -95,7 +95,7 @@ def sample_rays(optics: CameraOptics, tables: tuple, offset: mi.Point2f, lens: m
     ideal = centre + across * offset.x + down * offset.y
     origin = mi.Point3f(lens.x, lens.y, 0) * (optics.aperture_mm / 2)
     in_focus = mi.Point3f(ideal.x, ideal.y, 1) * optics.focus_mm
-    world_from_camera = to_mitsuba(rigid.invert(optics.camera.camera_from_world))
+    world_from_camera = _to_mitsuba(rigid.invert(optics.camera.camera_from_world))
     return mi.Ray3f(world_from_camera @ origin, dr.normalize(world_from_camera @ mi.Vector3f(in_focus - origin)))
 
 
@@ -132,19 +132,19 @@ def light_point(projector: ProjectorOptics, point: mi.Point3f, lens: mi.Point2f)
     """
     matrix = projector.camera.camera_from_world
     source = mi.Point3f(lens.x, lens.y, 0) * (projector.aperture_mm / 2)
-    local = to_mitsuba(matrix) @ point
+    local = _to_mitsuba(matrix) @ point
     toward = local - source
     in_focus = source + toward * (projector.focus_mm / toward.z)
     pixel, radius2 = _project(projector.camera, in_focus)
     distance2 = dr.squared_norm(toward)
     inverse_cosine = dr.sqrt(distance2) / toward.z
     irradiance = projector.plane_irradiance * inverse_cosine**3 / distance2 * (1 - projector.vignetting * radius2)
-    return to_mitsuba(rigid.invert(matrix)) @ source, pixel, dr.select(local.z > 0, irradiance, 0)
+    return _to_mitsuba(rigid.invert(matrix)) @ source, pixel, dr.select(local.z > 0, irradiance, 0)
 
 
 def pixels_per_mm(projector: ProjectorOptics, point: mi.Point3f, normal: mi.Normal3f) -> mi.Vector2f:
     """Change of the projector's column and of its row along a surface, each where it is steepest, without distortion : px/mm."""
-    matrix = to_mitsuba(projector.camera.camera_from_world)
+    matrix = _to_mitsuba(projector.camera.camera_from_world)
     local, across = matrix @ point, matrix @ mi.Vector3f(normal)
     focal = projector.camera.matrix[0, 0], projector.camera.matrix[1, 1]
     slopes = mi.Vector3f(1, 0, -local.x / local.z), mi.Vector3f(0, 1, -local.y / local.z)
@@ -170,7 +170,7 @@ def transmission(camera: Camera, lens: Lens) -> Images:
     return np.float32(cosine2**2 * (1 - lens.vignetting * radius2))
 
 
-def to_mitsuba(matrix: rigid.Array) -> mi.Transform4f:
+def _to_mitsuba(matrix: rigid.Array) -> mi.Transform4f:
     """A 4x4 transform for the ray tracer."""
     return mi.Transform4f(matrix.tolist())
 

@@ -107,7 +107,7 @@ def render_pixels(
 
     def body(index: mi.UInt32, sums: list[mi.Float], room: mi.Float) -> tuple:
         points = PairedPoints(pixel, index, tracing.samples, seed_word)
-        ray = sample_rays(camera, tables, pixel_offset(camera, points), points.mirrored_disc())
+        ray = sample_rays(camera, tables, _pixel_offset(camera, points), points.mirrored_disc())
         values, from_room = trace(scene, projector, (table, spread), tracing, points, ray, convex)
         return index + 1, [total + value for total, value in zip(sums, values, strict=True)], room + from_room
 
@@ -137,7 +137,7 @@ def meets_something(scene: mi.Scene, camera: CameraOptics) -> NDArray[np.bool_]:
     return np.asarray(scene.ray_test(middle)).reshape(camera.camera.size[::-1])
 
 
-def pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
+def _pixel_offset(camera: CameraOptics, points: PairedPoints) -> mi.Point2f:
     """Where in the image a sample lies, in px from its pixel's centre: within the pixel, spread by the lens's blur."""
     offset = points.mirrored_square()
     return camera.spread(offset) if camera.blur_px > 0 else offset

@@ -27,12 +27,12 @@ def ideal_rig(rig: Rig, scale: float = 1.0) -> tuple[Camera, ProjectorOptics]:
     offset = ((np.array(lens.size) - 1) / 2 - lens.matrix[:2, 2]) / lens.matrix[0, 0]
     turn = rigid.from_rotation_vector([offset[1], -offset[0], 0], [0, 0, 0])  # to where the offset lens threw its image
     return (
-        shrunk_pinhole(camera, scale, camera.camera_from_world),
-        ProjectorOptics(shrunk_pinhole(lens, scale, turn @ lens.camera_from_world), 0.0, 1.0, 0.0, projector.plane_irradiance),
+        _shrunk_pinhole(camera, scale, camera.camera_from_world),
+        ProjectorOptics(_shrunk_pinhole(lens, scale, turn @ lens.camera_from_world), 0.0, 1.0, 0.0, projector.plane_irradiance),
     )
 
 
-def shrunk_pinhole(camera: Camera, scale: float, camera_from_world: rigid.Array) -> Camera:
+def _shrunk_pinhole(camera: Camera, scale: float, camera_from_world: rigid.Array) -> Camera:
     """A pinhole with square pixels and the principal point in the middle of an image shrunk by `scale`."""
     size = (round(camera.size[0] * scale), round(camera.size[1] * scale))
     focal = camera.matrix[0, 0] * scale
@@ -54,16 +54,16 @@ def mitsuba_scene(scene: Scene, camera: Camera, projector: ProjectorOptics, deta
             **named_shapes(scene),
             "projector": {
                 "type": "projector",
-                "to_world": world_from_mitsuba(projector.camera),
-                "fov": field_of_view(projector.camera),
+                "to_world": _world_from_mitsuba(projector.camera),
+                "fov": _field_of_view(projector.camera),
                 "fov_axis": "x",
                 "scale": projector.plane_irradiance / np.pi,  # Mitsuba's projector multiplies by pi
                 "irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(blank), "raw": True, "wrap_mode": "clamp"},
             },
             "camera": {
                 "type": "perspective",
-                "to_world": world_from_mitsuba(camera),
-                "fov": field_of_view(camera),
+                "to_world": _world_from_mitsuba(camera),
+                "fov": _field_of_view(camera),
                 "fov_axis": "x",
                 "near_clip": 1.0,
                 "far_clip": 1e5,
@@ -102,11 +102,11 @@ def render_shown(world: mi.Scene, samples: int, seed: int, bounces: int = 1) -> 
     return np.asarray(mi.render(world, integrator=integrator, spp=samples, seed=seed))[:, :, 0]
 
 
-def field_of_view(camera: Camera) -> float:
+def _field_of_view(camera: Camera) -> float:
     """Horizontal field of view in deg."""
     return float(np.rad2deg(2 * np.arctan(camera.size[0] / 2 / camera.matrix[0, 0])))
 
 
-def world_from_mitsuba(camera: Camera) -> mi.ScalarTransform4f:
+def _world_from_mitsuba(camera: Camera) -> mi.ScalarTransform4f:
     """Pose of a camera in Mitsuba's convention."""
     return mi.ScalarTransform4f((rigid.invert(camera.camera_from_world) @ OPENCV_FROM_MITSUBA).tolist())

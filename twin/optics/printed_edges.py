@@ -21,7 +21,6 @@ from twin.optics.instruments import CameraOptics
 Array = NDArray[np.float64]
 Images = NDArray[np.float32]
 
-SAMPLES = 256  # of a pixel's light
 WINDOW = 15  # px about a pixel, in which black and white are looked for
 FEWEST = 40  # pixels of either that a plane needs
 BENDS = 4  # iterations to a ray's place on a bowed board, each a hundredth of the step before
@@ -106,7 +105,8 @@ def _footprint(optics: CameraOptics) -> Array:
 
 def _sample_points() -> Array:
     """Evenly spread points : (SAMPLES, 4), of the unit square for a place in the pixel and the unit disc for one on the lens."""
-    du, dv, radius2, turn = qmc.Sobol(4, seed=1).random(SAMPLES).T
+    samples = 256  # of a pixel's light
+    du, dv, radius2, turn = qmc.Sobol(4, seed=1).random(samples).T
     radius, angle = np.sqrt(radius2), 2 * np.pi * turn
     return np.column_stack([du, dv, radius * np.cos(angle), radius * np.sin(angle)])
 

@@ -11,8 +11,6 @@ from recon.geometry import rigid
 from recon.geometry.primitives import Sphere
 from scenes.scene_types import Material, Scene, Thing
 
-FILLED = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
-GEL_ROUGHNESS, GEL_IOR = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
 RAMP = 1024  # texels of the texture that turns a texture coordinate into a reflectance
 
 
@@ -24,7 +22,8 @@ def build_world(scene: Scene) -> mi.Scene:
 def is_convex(things: Sequence[Thing]) -> bool:
     """Whether closed things that don't overlap make up one convex body: they then fill their convex hull."""
     hull = ConvexHull(np.concatenate([thing.mesh.vertices for thing in things]))
-    return sum(thing.mesh.volume for thing in things) > (1 - FILLED) * hull.volume
+    filled = 1e-6  # of a convex hull's volume may be missing by rounding: over a board's area 0.000003 mm
+    return sum(thing.mesh.volume for thing in things) > (1 - filled) * hull.volume
 
 
 def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) -> None:
@@ -43,7 +42,7 @@ def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) 
 def named_shapes(scene: Scene) -> dict[str, mi.Shape]:
     """The visible things as shapes, under names that keep their order."""
     things = visible(scene)
-    return dict(zip(named(things), map(to_shape, things), strict=True))
+    return dict(zip(named(things), map(_to_shape, things), strict=True))
 
 
 def named(things: Sequence[Thing]) -> list[str]:
@@ -56,9 +55,9 @@ def visible(scene: Scene) -> list[Thing]:
     return [thing for thing in scene.things if not thing.inside]
 
 
-def to_shape(thing: Thing) -> mi.Shape:
+def _to_shape(thing: Thing) -> mi.Shape:
     """One thing as a shape with its material: an exact sphere where it is one, else its mesh."""
-    bsdf = mi.load_dict(to_bsdf(thing.material, thing.albedo is not None, thing.wet is not None))
+    bsdf = mi.load_dict(_to_bsdf(thing.material, thing.albedo is not None, thing.wet is not None))
     varied = thing.albedo is not None or thing.wet is not None
     if isinstance(thing.primitive, Sphere) and not varied:
         center = [float(value) for value in thing.primitive.centre]
@@ -86,21 +85,22 @@ def translucent(scene: Scene, world: mi.Scene) -> list[tuple[mi.Shape, float]]:
     return [(shape, thing.material.spread_mm) for thing, shape in shapes if thing.material.spread_mm > 0]
 
 
-def to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dict:
+def _to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dict:
     """A material as a Mitsuba plugin: Lambertian, or a rough dielectric coat on it, which gel may cover."""
     reflectance = ramp(0) if has_albedo else material.reflectance
     if material.roughness is None:
         dry = {"type": "diffuse", "reflectance": reflectance}
     else:
-        dry = coated(reflectance, material.roughness, material.ior)
+        dry = _coated(reflectance, material.roughness, material.ior)
     if not has_wet:
         return dry
-    same = body_reflection(dry) / body_reflection(coated(reflectance, GEL_ROUGHNESS, GEL_IOR))
+    gel_roughness, gel_ior = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
+    same = _body_reflection(dry) / _body_reflection(_coated(reflectance, gel_roughness, gel_ior))
     under_gel = ramp(0, same) if has_albedo else same * material.reflectance
-    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": coated(under_gel, GEL_ROUGHNESS, GEL_IOR)}
+    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": _coated(under_gel, gel_roughness, gel_ior)}
 
 
-def body_reflection(bsdf: dict) -> float:
+def _body_reflection(bsdf: dict) -> float:
     """Diffuse reflection of a plugin in one direction, 30 deg off the normal, in which gel changes it by nothing."""
     hit = dr.zeros(mi.SurfaceInteraction3f)
     hit.uv, (hit.wi, wo) = mi.Point2f(0.5), (mi.Vector3f(*way) for way in ((0.5, 0, 0.866), (0, 0.5, 0.866)))
@@ -109,7 +109,7 @@ def body_reflection(bsdf: dict) -> float:
     )
 
 
-def coated(reflectance: dict | float, roughness: float, ior: float) -> dict:
+def _coated(reflectance: dict | float, roughness: float, ior: float) -> dict:
     """A diffuse body under a rough dielectric coat."""
     return {
         "type": "roughplastic",

@@ -11,12 +11,12 @@ import drjit as dr
 import mitsuba as mi
 
 
-def hash_words(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
+def _hash_words(a: mi.UInt32, b: mi.UInt32) -> mi.UInt32:
     """A well-mixed 32-bit hash of two words (tiny encryption algorithm)."""
     return mi.sample_tea_32(a, b, 4)[0]
 
 
-def scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+def _scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Nested uniform (Owen) scrambling of a 32-bit fraction, by a Laine-Karras style hash of its reversed bits."""
     x = dr.brev(x) + seed
     for multiplier in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
@@ -26,14 +26,14 @@ def scramble(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 def sobol_pair(index: mi.UInt32, bits: int, seed: mi.UInt32) -> mi.Point2f:
     """Point `index` of a scrambled, shuffled 2-D Sobol' set of 2**bits points : values in [0, 1)."""
-    index = scramble(index, seed) & mi.UInt32((1 << bits) - 1)
+    index = _scramble(index, seed) & mi.UInt32((1 << bits) - 1)
     x = dr.brev(index)
     y, direction = mi.UInt32(0), 1 << 31
     for bit in range(bits):
         y ^= dr.select((index >> bit) & 1 == 1, mi.UInt32(direction), mi.UInt32(0))
         direction ^= direction >> 1
-    x = scramble(x, hash_words(seed, mi.UInt32(1)))
-    y = scramble(y, hash_words(seed, mi.UInt32(2)))
+    x = _scramble(x, _hash_words(seed, mi.UInt32(1)))
+    y = _scramble(y, _hash_words(seed, mi.UInt32(2)))
     return mi.Point2f(mi.Float(x >> 8), mi.Float(y >> 8)) * 2**-24
 
 
@@ -54,7 +54,7 @@ class PairedPoints:
     """
 
     def __init__(self, pixel: mi.UInt32, index: mi.UInt32, samples: int, seed: mi.UInt32) -> None:
-        self._key = hash_words(pixel, seed)
+        self._key = _hash_words(pixel, seed)
         self._index = index
         self._bits = samples.bit_length() - 1
         self._dimension = 0
@@ -66,7 +66,7 @@ class PairedPoints:
 
     def _next_seed(self) -> mi.UInt32:
         self._dimension += 1
-        return hash_words(self._key, mi.UInt32(self._dimension))
+        return _hash_words(self._key, mi.UInt32(self._dimension))
 
     def square(self) -> mi.Point2f:
         """The next point in the unit square, not mirrored."""

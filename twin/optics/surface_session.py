@@ -118,12 +118,12 @@ def noise_limit_px(
         sets = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.axis == axis]
         if sets:
             fringes, place = min(sets, key=lambda pair: pair[0].pitch)
-            sigma = phase_limit(electrons[place], fringes.shifts, device, exposure)
+            sigma = _phase_limit(electrons[place], fringes.shifts, device, exposure)
             limits[..., number] = fringes.pitch / (2 * np.pi) * sigma
     return limits
 
 
-def phase_limit(electrons: Images, shifts: NDArray[np.float64], device: CameraDevice, exposure: Exposure) -> Images:
+def _phase_limit(electrons: Images, shifts: NDArray[np.float64], device: CameraDevice, exposure: Exposure) -> Images:
     """Standard deviation of the least-squares phase : (h, w) rad, from noise-free N-step images : (n, h, w) electrons.
 
     The noise of each image carried through the fit: a change dI_k turns the phase by `-2/(N B) sin(phase + shift_k) dI_k`.

@@ -29,11 +29,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex64]
 
 NEAREST_MM = 2.0  # where the beam at the face is taken; Fresnel's approximation fails nearer
-ELEMENTS = 400  # points of the aperture in the integral
 OVERSAMPLING = 2  # axial samples a row of the image
-FAINT = 2e-3  # of the peak: the point spread ends there (-54 dB)
-EDGES = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
-REACH_MM = 4.0  # of the point spread along the array, at most
 STEP_MM = 0.025  # of the elevational table
 BAND = np.linspace(-1.1, 1.1, 23)  # frequencies of an echo, in its full widths at half amplitude beside the centre
 DEEPER = 1.2  # true depth that the tables reach, over the shown one
@@ -53,12 +49,13 @@ class Beam(NamedTuple):
     elevation_energy: Array  # (h,)
 
 
-def diffracted(
+def _diffracted(
     offsets: Array, depth: float, aperture: float, focus: float, wavelength: float, apodised: bool
 ) -> NDArray[np.complex128]:
     """Field H : (n,) of an aperture at offsets : (n,) mm from its axis, at a depth; `apodised` by a Hann window."""
-    s = (np.arange(ELEMENTS // 2) + 0.5) / ELEMENTS  # of one half; the other adds its mirror image: exp(ia) + exp(-ia) = 2 cos(a)
-    weight = (2 * np.cos(np.pi * s) ** 2 if apodised else np.ones(ELEMENTS // 2)) * aperture / ELEMENTS
+    elements = 400  # points of the aperture in the integral
+    s = (np.arange(elements // 2) + 0.5) / elements  # of one half; the other adds its mirror image: exp(ia) + exp(-ia) = 2 cos(a)
+    weight = (2 * np.cos(np.pi * s) ** 2 if apodised else np.ones(elements // 2)) * aperture / elements
     s = s * aperture
     k = 2 * np.pi / wavelength
     lens = weight * np.exp(1j * k * s**2 / 2 * (1 / depth - 1 / focus))
@@ -87,23 +84,25 @@ def beam(transducer: Transducer) -> Beam:
     )
 
 
-def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
+def _receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
     """Width of the dynamic receive aperture, mm, at a depth."""
     return np.clip(np.asarray(depth) / transducer.receive_f_number, NEAREST_MM / 2, transducer.aperture_mm)
 
 
 def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
     lines, wavelength = lines_of(transducer), transducer.wavelength_mm
-    taps = int(REACH_MM / lines.pitch_mm)
+    reach_mm = 4.0  # of the point spread along the array, at most
+    taps = int(reach_mm / lines.pitch_mm)
     transmit = transducer.transmit_focus_mm / transducer.transmit_f_number
     table = np.empty((len(rows), taps + 1), complex)
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
         offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
-        receive = float(receive_aperture(transducer, depth))
-        sent = diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
-        table[k] = sent * diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
+        receive = float(_receive_aperture(transducer, depth))
+        sent = _diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
+        table[k] = sent * _diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
-    seen = np.abs(table) >= FAINT * np.abs(table).max(axis=1, keepdims=True)
+    faint = 2e-3  # of the peak: the point spread ends there (-54 dB)
+    seen = np.abs(table) >= faint * np.abs(table).max(axis=1, keepdims=True)
     reach = np.maximum((np.arange(taps + 1) * seen).max(axis=1), 1)
     return np.hstack([table[:, :0:-1], table]), reach
 
@@ -134,7 +133,8 @@ def _elevation(transducer: Transducer, depths: Array) -> tuple[NDArray[np.comple
         wavelengths = transducer.wavelength_mm / np.maximum(1 + share, 0.2)
         table[k] = weight @ through_lens(offsets, depth, height, focus, wavelengths) ** 2 / height
     level = np.abs(table) / np.abs(table).max(axis=1, keepdims=True)
-    half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in EDGES)
+    edges = (0.03, 0.06)  # of the peak across the plane, two-way: the slice's end for surfaces and wires, and for scatterers
+    half, core = (np.where(level >= least, offsets, 0).max(axis=1) + STEP_MM for least in edges)
     return table, half, core
 
 

@@ -23,7 +23,7 @@ def focused(field: Field, beam: Beam) -> Field:
     return focused
 
 
-def reference_power(transducer: Transducer, beam: Beam) -> Array:
+def _reference_power(transducer: Transducer, beam: Beam) -> Array:
     """Mean power : (h,) of the echo of the reference tissue, without attenuation; a perfect mirror has about 1."""
     row = transducer.scale_mm_per_px[1] / OVERSAMPLING
     pulse = (beam.axial**2).sum(axis=1) * row
@@ -33,7 +33,7 @@ def reference_power(transducer: Transducer, beam: Beam) -> Array:
 def noise(transducer: Transducer, beam: Beam, rng: np.random.Generator) -> Field:
     """Electronic noise : (h, w), of the same power at every depth, before the gain."""
     height, width = len(beam.axial), lines_of(transducer).count
-    focus = np.interp(transducer.transmit_focus_mm, transducer.rows_mm, reference_power(transducer, beam))
+    focus = np.interp(transducer.transmit_focus_mm, transducer.rows_mm, _reference_power(transducer, beam))
     sigma = np.sqrt(focus / 2) * 10 ** (transducer.noise_db / 20)
     parts = rng.standard_normal((height, width, 2), dtype=np.float32)
     parts *= np.float32(sigma)
@@ -43,7 +43,7 @@ def noise(transducer: Transducer, beam: Beam, rng: np.random.Generator) -> Field
 def gain_over_depth(transducer: Transducer, beam: Beam) -> Array:
     """Amplification : (h,) that shows the reference tissue, attenuated as assumed, with a mean power of 1 at every depth."""
     loss = transducer.tgc_db_per_cm_mhz * transducer.frequency_mhz * transducer.rows_mm / 5
-    return 10 ** (np.minimum(loss, transducer.tgc_limit_db) / 20) / np.sqrt(reference_power(transducer, beam))
+    return 10 ** (np.minimum(loss, transducer.tgc_limit_db) / 20) / np.sqrt(_reference_power(transducer, beam))
 
 
 def face(transducer: Transducer) -> Array:

@@ -33,7 +33,7 @@ class Spans(NamedTuple):
     sides: NDArray[np.int8]  # (n / 8, m / 5, MOST, k) of each solid: INSIDE, OUTSIDE or NEAR
 
 
-class Bundles(NamedTuple):
+class _Bundles(NamedTuple):
     """Middles of the bundles on the probe's face, and figures common to all."""
 
     poses: Array  # (n / 8, 4, 4) mm, of a line through each
@@ -59,7 +59,7 @@ def spans(body: Body, lines: Lines, world_from_face: Array, along: Array, z: Arr
     reach = [max(np.ptp(part) for part in group) / 2 for group in groups]
     starts = np.array([part.min() for part in np.split(first_mm, range(BUNDLE[1], len(z), BUNDLE[1]))])
     radius = CLEAR * float(np.hypot(reach[0] * widening(deepest_mm, lines.bend), reach[1]))
-    bundles = Bundles(world_from_lines(lines, world_from_face, middles[0]), middles[1], starts, deepest_mm, radius)
+    bundles = _Bundles(world_from_lines(lines, world_from_face, middles[0]), middles[1], starts, deepest_mm, radius)
     solids, shape = body.packed(), (len(middles[0]), len(middles[1]))
     found = Spans(np.zeros((*shape, MOST, 2)), np.zeros(shape, np.int64), np.zeros((*shape, MOST, len(solids.grid)), np.int8))
 

@@ -17,8 +17,6 @@ from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
-SAME_MM = 1e-5  # between ends of neighbouring segments of a section
-
 
 def labels(paths: Paths, transducer: Transducer) -> NDArray[np.uint8]:
     """Label of what each pixel shows : (h, w), 0 the surroundings, k + 1 solid k; delays and refraction included."""
@@ -62,8 +60,9 @@ def _outlines(mesh: trimesh.Trimesh, image_from_world: Array) -> list[Array]:
     if len(segments) == 0:
         return []
     points = rigid.apply(image_from_world, segments)[..., :2]
-    keys, index = np.unique(np.rint(points.reshape(-1, 2) / SAME_MM).astype(np.int64), axis=0, return_inverse=True)
-    places = keys * SAME_MM
+    same_mm = 1e-5  # between ends of neighbouring segments of a section
+    keys, index = np.unique(np.rint(points.reshape(-1, 2) / same_mm).astype(np.int64), axis=0, return_inverse=True)
+    places = keys * same_mm
     return [places[loop] for loop in _loops(index.reshape(-1, 2))]
 
 

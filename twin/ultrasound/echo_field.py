@@ -22,7 +22,6 @@ Field = NDArray[np.complex64]
 
 BESIDE_MM = 2.0  # beside the image, from where echoes still count
 PARTS = 16  # in which echoes are summed
-SPREAD = 7  # without a common factor with PARTS
 
 
 class Scanner(NamedTuple):
@@ -94,7 +93,8 @@ def laid(lay: Callable[[Field, int], tuple[int, int]], empty: Field) -> Field:
 
 def slab(part: int, count: int) -> tuple[int, int]:
     """First and end of a part's share of a count. Threads take parts in order: so each gets some from everywhere."""
-    place = part * SPREAD % PARTS
+    spread = 7  # without a common factor with PARTS
+    place = part * spread % PARTS
     return count * place // PARTS, count * (place + 1) // PARTS
 
 

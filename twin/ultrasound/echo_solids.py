@@ -25,13 +25,7 @@ from twin.conditions import Sound
 
 Array = NDArray[np.float64]
 
-SPACING_MM = (0.5, 1.0)  # of the grids, of small and of large solids
-LARGE_MM = 60.0  # greatest extent of a small one
-MOST_POINTS = 3e8  # of a grid
 MARGIN_MM = 3.0  # of the grids, around the solid
-SAG_MM = 0.001  # by which a rod's wall lies within the true one: of a chord between the points of its grid
-BAND_MM = 3.0  # from a mesh, beyond which only the sign of its distance counts
-THIN_MM = 0.5  # radius, below which a rod is a wire
 
 FIRST, NX, NY, NZ = range(4)  # columns of `Solids.grid`
 X0, Y0, Z0, PER_X, PER_Y, PER_Z = range(6)  # columns of `Solids.frame`
@@ -127,9 +121,10 @@ def body(scene: Scene) -> Body:
     """
     shapes = {shape.name: shape for shape in scene.shapes if isinstance(shape, Cylinder)}
     solids, wires = [], []
+    thin_mm = 0.5  # radius, below which a rod is a wire
     for thing in scene.things:
         tissue, shape = tissue_of(scene, thing), shapes.get(thing.name)
-        if shape is not None and shape.radius < THIN_MM:
+        if shape is not None and shape.radius < thin_mm:
             along = (thing.mesh.vertices - shape.point) @ shape.axis
             ends = shape.point + np.outer([along.min(), along.max()], shape.axis)
             wires.append(Wire(thing.name, tissue, ends, shape.radius))
@@ -151,9 +146,10 @@ def at_speeds(body: Body, errors: Sound, *key: int) -> Body:
 def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
     """A thing by its signed distance: exact for boxes along the axes, spheres and cylinders, sampled from the mesh otherwise."""
     bounds = thing.mesh.bounds
+    sag_mm = 0.001  # by which a rod's wall lies within the true one: of a chord between the points of its grid
     if shape is not None:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
-        across = min(_spacing(thing), float(np.sqrt(8 * shape.radius * SAG_MM)))
+        across = min(_spacing(thing), float(np.sqrt(8 * shape.radius * sag_mm)))
         steps = np.where(np.abs(shape.axis) > 1 - 1e-9, _spacing(thing), across)  # along the axis the wall is straight
         return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), steps)
     if thing.primitive is not None:
@@ -167,7 +163,9 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
 
 
 def _spacing(thing: Thing) -> float:
-    return SPACING_MM[int(thing.mesh.extents.max() > LARGE_MM)]
+    large_mm = 60.0  # greatest extent of a small one
+    spacing_mm = (0.5, 1.0)  # of the grids, of small and of large solids
+    return spacing_mm[int(thing.mesh.extents.max() > large_mm)]
 
 
 def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
@@ -180,8 +178,9 @@ def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
 
 
 def _check_count(name: str, counts: Array) -> None:
-    if (points := np.prod(counts.astype(float))) > MOST_POINTS:
-        raise InputError(f"scene: {name}: expected a thing whose grid has up to {MOST_POINTS:g} points, found {points:.2g}")
+    most_points = 3e8  # of a grid
+    if (points := np.prod(counts.astype(float))) > most_points:
+        raise InputError(f"scene: {name}: expected a thing whose grid has up to {most_points:g} points, found {points:.2g}")
 
 
 def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:
@@ -215,9 +214,10 @@ def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.
     for a flat base may have no vertices of its own.
     """
     flat = points.reshape(-1, 3)
-    far, nearest = surface_tree(mesh.vertices).query(flat, distance_upper_bound=BAND_MM)
+    band_mm = 3.0  # from a mesh, beyond which only the sign of its distance counts
+    far, nearest = surface_tree(mesh.vertices).query(flat, distance_upper_bound=band_mm)
     near = np.isfinite(far)
-    value = np.full(len(flat), BAND_MM)
+    value = np.full(len(flat), band_mm)
     value[near] = ((flat[near] - mesh.vertices[nearest[near]]) * mesh.vertex_normals[nearest[near]]).sum(axis=1)
     value, near = value.reshape(points.shape[:-1]), near.reshape(points.shape[:-1])
     beyond = np.maximum(mesh.bounds[0] - points, points - mesh.bounds[1]).max(axis=-1)
@@ -225,7 +225,7 @@ def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.
     votes = np.sign(value[tuple(source)])
     regions, count = label(~near & (beyond < 0))
     side = np.sign(sum_labels(votes, regions, np.arange(count + 1)))
-    value = np.where(near, value, np.where(regions > 0, BAND_MM * side[regions], beyond))
+    value = np.where(near, value, np.where(regions > 0, band_mm * side[regions], beyond))
     return np.maximum(value, beyond).astype(np.float32)
 
 

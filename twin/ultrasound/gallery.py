@@ -28,8 +28,6 @@ STATIONS = (  # title, scene, array, face in the world, direction of the array
     ("rod in gelatin", "cylinders", TISSUE, (4.0, -2.0, 640.0), (0, 1, 0)),
     ("test object", "test_object", TISSUE, (4.0, -2.0, 650.0), (1, 0, 0)),
 )
-COLUMNS = 4
-GAP_PX, TITLE_PX = 6, 22
 
 
 def bscans() -> dict[str, NDArray[np.uint8]]:
@@ -50,11 +48,13 @@ def bscans() -> dict[str, NDArray[np.uint8]]:
 def sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Images of one size, each under its title, in rows of `COLUMNS`."""
     tiles = []
+    gap_px, title_px = 6, 22
     for title, image in images.items():
-        tile = cv2.copyMakeBorder(image, TITLE_PX, GAP_PX, GAP_PX, GAP_PX, cv2.BORDER_CONSTANT, value=255)
-        tiles.append(cv2.putText(tile, title, (GAP_PX, TITLE_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA))
-    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % COLUMNS)
-    return np.vstack([np.hstack(tiles[k : k + COLUMNS]) for k in range(0, len(tiles), COLUMNS)])
+        tile = cv2.copyMakeBorder(image, title_px, gap_px, gap_px, gap_px, cv2.BORDER_CONSTANT, value=255)
+        tiles.append(cv2.putText(tile, title, (gap_px, title_px - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 0, 1, cv2.LINE_AA))
+    columns = 4
+    tiles += [np.full_like(tiles[0], 255)] * (-len(tiles) % columns)
+    return np.vstack([np.hstack(tiles[k : k + columns]) for k in range(0, len(tiles), columns)])
 
 
 def main() -> None:

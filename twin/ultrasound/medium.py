@@ -32,7 +32,7 @@ LABEL, ALONG, DEPTH, P, Q, R = range(3, 9)  # the others: tissue, place on the l
 NEAR_BORDER = -1  # a label that has to be looked up at each place
 
 
-class Lattice(NamedTuple):
+class _Lattice(NamedTuple):
     """Cells around the slice, in columns along one of the lattice's axes, and the strength of their scatterers."""
 
     edge_mm: float
@@ -69,7 +69,7 @@ def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_
     return laid(lay, field_like(transducer, beam))
 
 
-def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lattice:
+def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> _Lattice:
     edge = transducer.scatterers_per_mm3 ** (-1 / 3)
     strength = np.sqrt(body.scattering() / transducer.scatterers_per_mm3) * transducer.wavelength_mm
     turns = np.exp(2j * np.pi * np.arange(TURNS) / TURNS).astype(np.complex64)
@@ -77,7 +77,7 @@ def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> Lat
     low, high = _box(transducer, beam, pose, edge)
     face_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
     half = _half_thickness(beam, pose, axes[2], edge, transducer.face is not None)
-    return Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), turns)
+    return _Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), turns)
 
 
 def _axes(pose: Array) -> NDArray[np.int64]:

@@ -24,12 +24,7 @@ Array = NDArray[np.float64]
 
 RATE_HZ = 100.0  # of the poses that make up a path
 MOST_S = 3600.0  # of a path
-SEARCH_MM = 0.1  # steps in which the surface is looked for
-FOOT_MM = 8.0  # width of the probe's foot across the array
-FOOT_POINTS = (21, 5)  # of the foot, along and across the array
-MOVE_S = 1.0  # from one rest to the next; over such a gap no pose is interpolated
 CALM = tremor.draw(0.0, 0.0, 0)  # a hand without tremor
-TOUCHING_MM = 2.0  # between the axes of two wires that cross
 
 
 class Hand(Part):
@@ -143,7 +138,8 @@ def crossing(body: Body) -> Array:
     shares = np.linalg.lstsq(np.column_stack([along[0], -along[1]]), ends[1, 0] - ends[0, 0])[0]
     nearest = ends[:, 0] + shares[:, None] * along
     apart = float(np.linalg.norm(nearest[1] - nearest[0]))
-    if apart > TOUCHING_MM or (shares < 0).any() or (shares > 1).any():
+    touching_mm = 2.0  # between the axes of two wires that cross
+    if apart > touching_mm or (shares < 0).any() or (shares > 1).any():
         raise InputError(f"{expected} two that don't touch")
     return nearest.mean(axis=0)
 
@@ -163,7 +159,8 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
     beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
     poses = held(body, transducer, turns, pixels, beside)
     steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
-    starts = np.rint(np.arange(path.count) * (path.rest_s + MOVE_S) * 1e9).astype(np.int64)
+    move_s = 1.0  # from one rest to the next; over such a gap no pose is interpolated
+    starts = np.rint(np.arange(path.count) * (path.rest_s + move_s) * 1e9).astype(np.int64)
     rests = Track((starts[:, None] + steps).ravel(), np.repeat(poses, len(steps), axis=0))
     return rests, starts + steps[-1] // 2
 
@@ -191,8 +188,10 @@ def _upright(turn_deg: float) -> Array:
 def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transducer) -> Array:
     """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
     axes = _upright(path.turn_deg)
+    foot_mm = 8.0  # width of the probe's foot across the array
+    foot_points = (21, 5)  # of the foot, along and across the array
     along, across = np.meshgrid(
-        np.linspace(-0.5, 0.5, FOOT_POINTS[0]) * transducer.foot_mm, np.linspace(-0.5, 0.5, FOOT_POINTS[1]) * FOOT_MM
+        np.linspace(-0.5, 0.5, foot_points[0]) * transducer.foot_mm, np.linspace(-0.5, 0.5, foot_points[1]) * foot_mm
     )
     foot = place + np.outer(along.ravel(), axes[:2, 0]) + np.outer(across.ravel(), axes[:2, 2])
     height = top(solid, foot)
@@ -210,7 +209,7 @@ def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transduce
     turn = turn @ Rotation.from_euler("zx", [path.tilt_deg[0], path.tilt_deg[1]], degrees=True).as_matrix()
     surface = np.column_stack([foot[seen], height[seen]])
     middle = np.array([*place, level])
-    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.foot_mm / 2, FOOT_MM / 2]).all(axis=1)
+    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.foot_mm / 2, foot_mm / 2]).all(axis=1)
     gap = ((surface - middle) @ turn[:, 1])[under].min()
     return rigid.transform(turn, middle + (gap - path.standoff_mm) * turn[:, 1])
 
@@ -218,7 +217,8 @@ def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transduce
 def top(solid: Solid, places: Array) -> Array:
     """Z of a solid's side that faces the cameras, at x, y : (n, 2) mm; NaN beside it."""
     low, high = solid.mesh.bounds[:, 2]
-    depths = np.arange(low - 1, high, SEARCH_MM)
+    search_mm = 0.1  # steps in which the surface is looked for
+    depths = np.arange(low - 1, high, search_mm)
     points = np.concatenate([np.repeat(places, len(depths), axis=0), np.tile(depths, len(places))[:, None]], axis=1)
     grid = ((points - solid.origin) / solid.spacing).T
     distance = map_coordinates(solid.distance, grid, order=1, mode="constant", cval=1e3).reshape(len(places), -1)
@@ -226,7 +226,7 @@ def top(solid: Solid, places: Array) -> Array:
     rows = np.arange(len(places))
     before, after = distance[rows, np.maximum(first - 1, 0)], distance[rows, first]
     share = before / np.where(before == after, 1, before - after)
-    return np.where(first > 0, depths[np.maximum(first - 1, 0)] + share * SEARCH_MM, np.nan)
+    return np.where(first > 0, depths[np.maximum(first - 1, 0)] + share * search_mm, np.nan)
 
 
 def _led(faces: Array, hand: Hand, shaken: Tremor, transducer: Transducer, seed: int) -> Track:

@@ -63,7 +63,7 @@ class Ray(NamedTuple):
     dz: float
 
 
-class Strand(NamedTuple):
+class _Strand(NamedTuple):
     """Points of a wire, and the echoes of each."""
 
     world: Array  # (n, 3) mm
@@ -120,7 +120,7 @@ def wire_echoes(body: Body, transducer: Transducer, beam: Beam, paths: Paths, wo
     return field
 
 
-def _strand(wire: Wire, around: float, transducer: Transducer, world_from_face: Array) -> Strand:
+def _strand(wire: Wire, around: float, transducer: Transducer, world_from_face: Array) -> _Strand:
     """A wire's points, every ALONG_MM, in a medium of an impedance."""
     face_from_world, lines = np.linalg.inv(world_from_face), lines_of(transducer)
     length = float(np.linalg.norm(wire.ends[1] - wire.ends[0]))
@@ -137,7 +137,7 @@ def _strand(wire: Wire, around: float, transducer: Transducer, world_from_face: 
     ring = 2 * wire.radius * transducer.assumed_speed / wire.tissue.speed
     echoes = [(0.0, bounce)] + [(ring * n, -bounce * (1 - bounce**2) * bounce ** (2 * n - 2)) for n in range(1, RINGS + 1)]
     strength = np.sqrt(wire.radius * transducer.wavelength_mm / 2) * length / count
-    return Strand(points, front, rise, wire.tissue.roughness, np.array(echoes) * [1, strength])
+    return _Strand(points, front, rise, wire.tissue.roughness, np.array(echoes) * [1, strength])
 
 
 @njit(inline="always")

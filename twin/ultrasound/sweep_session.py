@@ -31,7 +31,6 @@ POSES = "sweep.npz"  # in the sweep's own folder of truth
 LABELS = "labels"
 PURPOSES: dict[str, Purpose] = {"wire": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
 SUPPORTS = ("table", "tank")  # what things lie on or in
-GIVES_MM = 5.0  # by which a surface gives way to the probe, at most
 
 
 def plan_sweep(
@@ -55,18 +54,19 @@ def plan_sweep(
     """
     shaken = conditions.trembling(errors, seed)
     path_seed, clock_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
+    gives_mm = 5.0  # by which a surface gives way to the probe, at most
     match path:
         case SurfacePath():
             course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            refuse_inside(course, body, transducer, GIVES_MM)
+            _refuse_inside(course, body, transducer, gives_mm)
         case Bob():
             course = bobbing(path, transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            refuse_inside(course, body, transducer)
+            _refuse_inside(course, body, transducer)
         case WirePath():
             course, taken = about_crossing(path, body, transducer, path_seed)
-            refuse_inside(course, body, transducer)
+            _refuse_inside(course, body, transducer)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 
 
@@ -88,7 +88,7 @@ def surface_of(name: str, body: Body) -> Solid:
     return others[0]
 
 
-def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm: float = 0.0) -> None:
+def _refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm: float = 0.0) -> None:
     """Refuse a course on which the array's face gets into a solid, by more than is allowed.
 
     Raises
@@ -154,7 +154,7 @@ def write_session(
     probe : of the capture; None where it is still to be calibrated.
     film : of the cameras, in which the poses are then still to be found; None where the poses are given.
     """
-    with session.write(describe_sound(scene, body)) as (capture, truth):
+    with session.write(_describe_sound(scene, body)) as (capture, truth):
         own = truth.own.relative_to(truth.folder)
         truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
 
@@ -179,7 +179,7 @@ def write_session(
             capture.add_probe(probe)
 
 
-def describe_sound(scene: Scene, body: Body) -> dict[str, object]:
+def _describe_sound(scene: Scene, body: Body) -> dict[str, object]:
     """A scene as the scanner shows it: the names of its labels, and the wires' ends."""
     labels = ["surroundings", *(solid.name for solid in body.solids)]
     wires = [{"name": wire.name, "ends_mm": wire.ends.tolist(), "radius_mm": wire.radius} for wire in body.wires]

@@ -21,7 +21,6 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 
 STILL = conditions.Motion()
-MOST_MOMENTS = 1_000_000  # of a sweep
 Jitter = Annotated[float, Field(ge=0, le=1)]  # s
 
 
@@ -108,9 +107,10 @@ def sweep(
 def moments(path: Track, rate_hz: float) -> NDArray[np.int64]:
     """Moments : (n,) ns on a path, at an even rate from its start."""
     length = (path.times[-1] - path.times[0]) * 1e-9
-    if length * rate_hz > MOST_MOMENTS:
+    most_moments = 1_000_000  # of a sweep
+    if length * rate_hz > most_moments:
         found = f"{length * rate_hz:.3g} at {rate_hz:g} Hz over {length:g} s"
-        raise InputError(f"clocks: expected up to {MOST_MOMENTS} images, found {found}")
+        raise InputError(f"clocks: expected up to {most_moments} images, found {found}")
     return path.times[0] + np.rint(np.arange(int(length * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
 
 

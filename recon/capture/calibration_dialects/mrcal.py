@@ -20,12 +20,12 @@ LISTED = re.compile(rf"\[\s*(?:{NUMBER}\s*(?:,\s*{NUMBER}\s*)*,?\s*)?\]")
 
 def recognises(content: Content) -> bool:
     """Whether a file of the folder, or the file itself, names a lens model."""
-    return bool(content.of_cameras(is_model))
+    return bool(content.of_cameras(_is_model))
 
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """All devices, a file each, by their poses."""
-    texts = content.of_cameras(is_model)
+    texts = content.of_cameras(_is_model)
     if not content.path.is_dir():
         (text,) = texts.values()
         return camera_dialects.of_metres(content.path, camera_dialects.in_world({WORLD: _mrcal(content.path, text)}))
@@ -39,7 +39,7 @@ def taken(optics: Calibration) -> Sequence[str]:
     return list(optics.cameras)
 
 
-def is_model(text: str) -> bool:
+def _is_model(text: str) -> bool:
     """Whether a text names a lens model as mrcal's files do."""
     return re.search(r"""^\s*\{?\s*['"]lens_?model['"]\s*:""", text, re.MULTILINE) is not None
 

@@ -18,7 +18,6 @@ from recon.model.calibration import WORLD, Calibration, Uncertainty
 from recon.model.lengths import UNIT_KEY
 
 SCHEMA = "sonotwin-optics/1"
-OWN_KEYS = ("schema", "parameters", "covariance", UNIT_KEY)  # any other is a device
 
 
 def recognises(content: Content) -> bool:
@@ -36,7 +35,8 @@ def _calibration(path: Path, values: Values) -> Calibration:
         found = short(values["schema"]) if isinstance(values["schema"], str) else "a value that is no text"
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
     cameras = {}
-    for name in [name for name in values if name not in OWN_KEYS]:
+    own_keys = ("schema", "parameters", "covariance", UNIT_KEY)  # any other is a device
+    for name in [name for name in values if name not in own_keys]:
         device = values[name]
         if not isinstance(device, dict):
             raise InputError(f"{path}: {name}: expected size, matrix, distortion and camera_from_world, found something else")

@@ -17,10 +17,9 @@ from recon.geometry.camera import Array, Camera
 from recon.model.calibration import WORLD, Calibration
 
 ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
-LEAST_FORWARD = 0.1  # cosine
 
 
-class Rectified(NamedTuple):
+class _Rectified(NamedTuple):
     """A camera of ROS's: its rectification, too."""
 
     stored: Stored
@@ -30,12 +29,12 @@ class Rectified(NamedTuple):
 
 def recognises(content: Content) -> bool:
     """Whether a file of the folder, or the file itself, has a camera's matrix."""
-    return bool(content.of_cameras(is_camera_info))
+    return bool(content.of_cameras(_is_camera_info))
 
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """A camera, or a pair of them by their rectification."""
-    texts = content.of_cameras(is_camera_info)
+    texts = content.of_cameras(_is_camera_info)
     if not content.path.is_dir():
         (text,) = texts.values()
         return camera_dialects.of_metres(content.path, {WORLD: _ros(content.path, text).stored})
@@ -47,7 +46,7 @@ def taken(optics: Calibration) -> Sequence[str]:
     return pair(optics)
 
 
-def is_camera_info(text: str) -> bool:
+def _is_camera_info(text: str) -> bool:
     """Whether a text has a camera's matrix, and is no camchain."""
     return re.search(r"^camera_matrix\s*:", text, re.MULTILINE) is not None and not kalibr.is_camchain(text)
 
@@ -96,9 +95,10 @@ def _rectified(cameras: Sequence[Camera]) -> list[tuple[Array, Array]]:
         turns = [np.array(rows), np.array(rows) @ pose[:3, :3].T]
         shift[axis] = -(along @ between) / MM
     seen = []  # at the middles of the images, turned; of devices that look aside of the common view, none
+    least_forward = 0.1  # cosine
     for turn, camera in zip(turns, cameras, strict=True):
         middle = turn @ np.linalg.solve(camera.matrix, np.append((np.array(camera.size) - 1) / 2, 1))
-        seen += [middle[:2] / middle[2]] if middle[2] > LEAST_FORWARD else []
+        seen += [middle[:2] / middle[2]] if middle[2] > least_forward else []
     centre = (np.array(cameras[0].size) - 1) / 2 - focal * np.mean(seen or [np.zeros(2)], axis=0)
     plain = np.column_stack([camera_dialects.pinhole(focal, focal, *centre), np.zeros(3)])
     moved = plain + np.pad(focal * shift[:, None], ((0, 0), (3, 0)))
@@ -130,7 +130,7 @@ def _pair(folder: Path, texts: Mapping[Path, str]) -> dict[str, Stored]:
     return camera_dialects.in_world(found)
 
 
-def _ros(path: Path, text: str) -> Rectified:
+def _ros(path: Path, text: str) -> _Rectified:
     content = yaml_text.loaded(path, text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a camera's fields, found {brief(content)}")
@@ -151,7 +151,7 @@ def _ros(path: Path, text: str) -> Rectified:
     projection = np.column_stack([matrix, np.zeros(3)])
     if "projection_matrix" in content:
         projection = _entries(path, content, "projection_matrix", (3, 4))
-    return Rectified(Stored(size, matrix, k, np.eye(4)), rotation, projection)
+    return _Rectified(Stored(size, matrix, k, np.eye(4)), rotation, projection)
 
 
 def _entries(path: Path, content: Mapping[str, Any], name: str, shape: tuple[int, ...] | None = None) -> Array:

@@ -11,8 +11,6 @@ from recon.errors import InputError
 from recon.geometry.camera import Array
 from recon.model.calibration import Calibration
 
-KEYS = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
-
 
 def recognises(content: Content) -> bool:
     """Whether the matrix of the projector is there, or that of the camera without one of a second."""
@@ -21,7 +19,8 @@ def recognises(content: Content) -> bool:
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """Camera and projector."""
-    path, values = content.path, camera_dialects.matrices(content.path, content.values, KEYS)
+    keys = ("M1", "D1", "M4", "D4", "Rlp", "Tlp", "S")
+    path, values = content.path, camera_dialects.matrices(content.path, content.values, keys)
     return camera_dialects.of_mm(content, _calibration(path, values, sizes))
 
 

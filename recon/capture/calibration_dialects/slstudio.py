@@ -13,7 +13,6 @@ from recon.files import opencv_storage
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 
-SLSTUDIO = ("Kc", "kc", "Kp", "kp", "Rp", "Tp")
 SLSTUDIO_SIZES = {"cam1": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
 
 
@@ -62,7 +61,8 @@ def _stored(path: Path, values: opencv_storage.Values, sizes: Sizes) -> dict[str
     InputError
         If a matrix or a size is missing.
     """
-    matrices = {key: opencv_storage.matrix(path, key, values.get(key)) for key in SLSTUDIO}
+    slstudio = ("Kc", "kc", "Kp", "kp", "Rp", "Tp")
+    matrices = {key: opencv_storage.matrix(path, key, values.get(key)) for key in slstudio}
     if matrices["Rp"].shape != (3, 3) or matrices["Tp"].size != 3:
         shapes = f"{matrices['Rp'].shape} and {matrices['Tp'].shape}"
         raise InputError(f"{path}: Rp, Tp: expected a 3x3 rotation and 3 translations in mm, found {shapes}")

@@ -15,7 +15,6 @@ from recon.geometry.camera import Array
 from recon.model.calibration import Calibration
 from recon.model.lengths import UNIT_KEY
 
-KEYS = ("K1", "dist1", "K2", "dist2", "R", "t")
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 
 
@@ -26,12 +25,13 @@ def recognises(content: Content) -> bool:
 
 def read(content: Content, sizes: Sizes) -> Calibration:
     """Both devices."""
+    keys = ("K1", "dist1", "K2", "dist2", "R", "t")
     if content.is_packed:
-        forms = dict.fromkeys(KEYS, npz.Form("fiu")) | {UNIT_KEY: npz.Form("fiu", optional=True)}
+        forms = dict.fromkeys(keys, npz.Form("fiu")) | {UNIT_KEY: npz.Form("fiu", optional=True)}
         values = matlab.read(content.path, forms, OLD_KEYS) if content.is_matlab else npz.read(content.path, forms)
         arrays = {name: array.astype(float) for name, array in values.items()}
         return camera_dialects.of_mm(content, _calibration(content.path, arrays, sizes), arrays.get(UNIT_KEY))
-    values = camera_dialects.matrices(content.path, content.values, KEYS)
+    values = camera_dialects.matrices(content.path, content.values, keys)
     return camera_dialects.of_mm(content, _calibration(content.path, values, sizes))
 
 

@@ -10,9 +10,6 @@ from recon.errors import InputError, short
 from recon.files.opencv_storage import Values
 from recon.model.calibration import Calibration
 
-PAIR_KEYS = ("M1", "D1", "M2", "D2")
-PAIR_MOTIONS = (("Rlr", "Tlr"), ("R", "T"))
-
 
 def recognises(content: Content) -> bool:
     """Whether the matrix of a second camera is there, and none of a projector."""
@@ -25,13 +22,15 @@ def read(content: Content, sizes: Sizes) -> Calibration:
 
 
 def _calibration(path: Path, stored: Values, sizes: Sizes) -> Calibration:
-    motion = next((pair for pair in PAIR_MOTIONS if set(pair) <= stored.keys()), None)
+    pair_motions = (("Rlr", "Tlr"), ("R", "T"))
+    motion = next((pair for pair in pair_motions if set(pair) <= stored.keys()), None)
     if motion is None:
         raise InputError(
             f"{path}: expected Rlr and Tlr, or R and T, which take camera 1 to camera 2, found {short(', '.join(stored))}; "
             "OpenCV's stereo_calib leaves R and T in extrinsics.yml: copy them into this file"
         )
-    values = camera_dialects.matrices(path, stored, (*PAIR_KEYS, *motion))
+    pair_keys = ("M1", "D1", "M2", "D2")
+    values = camera_dialects.matrices(path, stored, (*pair_keys, *motion))
     first = camera_dialects.camera(
         path, "cam1", camera_dialects.size_of(path, "cam1", sizes), values["M1"], values["D1"], np.eye(4)
     )

@@ -21,11 +21,7 @@ log = logging.getLogger(__name__)
 
 MOST_WAITING = 64  # messages that nobody has fetched yet; beyond, the oldest are lost
 MOST_WAITING_BYTES = 128 << 20
-PIECE = 1 << 18  # bytes that are read at once
-LOOK_S = 0.2  # between two looks at whether to end
-CONNECT_S = 5.0
 AGAIN_S = 1.0  # after a lost connection
-MOST_SEEN = 50  # names that are remembered for messages to people
 
 
 @dataclass(frozen=True)
@@ -113,8 +109,11 @@ class Client:
 
     def _listen(self, complaints: Complaints) -> None:
         """Connect, and read until the connection ends."""
-        with socket.create_connection(self._address, CONNECT_S) as connection:
-            connection.settimeout(LOOK_S)
+        connect_s = 5.0
+        piece = 1 << 18  # bytes that are read at once
+        look_s = 0.2  # between two looks at whether to end
+        with socket.create_connection(self._address, connect_s) as connection:
+            connection.settimeout(look_s)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
             for message in self._first:
@@ -124,7 +123,7 @@ class Client:
             splitter, pace = self._splitter(), Pace()
             while not self._ends.is_set():
                 with suppress(TimeoutError):
-                    self._read(connection.recv(PIECE), splitter, pace, complaints)
+                    self._read(connection.recv(piece), splitter, pace, complaints)
 
     def _read(self, data: bytes, splitter: Splitter, pace: Pace, complaints: Complaints) -> None:
         if not data:
@@ -150,6 +149,7 @@ class Client:
             self._change.notify()
 
     def _wants(self, header: Header) -> bool:
-        if len(self._seen) < MOST_SEEN:
+        most_seen = 50  # names that are remembered for messages to people
+        if len(self._seen) < most_seen:
             self._seen[header.name] = None
         return self._wanted(header)

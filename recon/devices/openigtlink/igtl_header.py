@@ -17,15 +17,11 @@ from recon.errors import InputError, short
 HEADER = struct.Struct(">H12s20sQQQ")  # version, kind, device, time, size of the body, checksum of the body
 EXTENDED = struct.Struct(">HHII")  # its own size, sizes of the metadata's index and content, number of the message
 ENTRY = struct.Struct(">HHI")  # length of the key, encoding and length of the value
-VERSIONS = (1, 2)  # of the header: protocols 1 and 2 write 1, protocol 3 writes 2
 ENCODINGS = {3: "ascii", 4: "latin-1", 106: "utf-8"}  # numbers of the IANA character sets
 ASCII, UTF8 = 3, 106
 SECOND = 10**9  # ns
-LAST_SECOND = 2**32  # since 1970; the field ends in 2106
 MOST_NAME_BYTES = 20  # of a device
 MOST_BODY_BYTES = 64 << 20  # a volume of 64 MB; a live image has less than 10
-MOST_ENTRIES = 1000  # of the metadata
-FARTHEST_MM = 1e9
 KIND = re.compile(rb"[A-Za-z0-9_]{1,12}\0*")
 
 
@@ -64,7 +60,8 @@ def read_header(data: bytes, most_bytes: int = MOST_BODY_BYTES) -> Header:
         If they are none of a message, or announce a body of more bytes than `most_bytes`.
     """
     version, kind, device, time, size, checksum = HEADER.unpack(data)
-    if version not in VERSIONS or not KIND.fullmatch(kind):
+    versions = (1, 2)  # of the header: protocols 1 and 2 write 1, protocol 3 writes 2
+    if version not in versions or not KIND.fullmatch(kind):
         raise InputError(f"header: expected one of OpenIGTLink, version 1 or 2, found {short(repr(data[:14]))}")
     header = Header(version, text(kind), text(device, UTF8), nanoseconds(time) if time else None, size, checksum)
     if size > most_bytes:
@@ -123,7 +120,8 @@ def fixed_point(time_ns: int | None) -> int:
     """A time since 1970 as seconds with 32 bits before and after the point; 0 is none."""
     if time_ns is None:
         return 0
-    if not 0 <= time_ns < LAST_SECOND * SECOND:
+    last_second = 2**32  # since 1970; the field ends in 2106
+    if not 0 <= time_ns < last_second * SECOND:
         raise InputError(f"OpenIGTLink: expected a time of 1970 to 2106, found {time_ns} ns since 1970")
     seconds, rest = divmod(time_ns, SECOND)
     return (seconds << 32) + (rest << 32) // SECOND  # one of 4.3e9 parts is shorter than 1 ns: it reads back
@@ -146,8 +144,9 @@ def encoded(value: str) -> tuple[int, bytes]:
 
 def finite(numbers: NDArray) -> NDArray[np.float64]:
     """Numbers of a message, if all are some; InputError if not: what is none comes from senders that have no pose."""
-    if not (np.abs(numbers) < FARTHEST_MM).all():
-        raise InputError(f"expected finite numbers below {FARTHEST_MM:g}, found {short(str(numbers.ravel()[:12].tolist()))}")
+    farthest_mm = 1e9
+    if not (np.abs(numbers) < farthest_mm).all():
+        raise InputError(f"expected finite numbers below {farthest_mm:g}, found {short(str(numbers.ravel()[:12].tolist()))}")
     return numbers.astype(float)
 
 
@@ -201,8 +200,9 @@ def _metadata(header: Header, index: memoryview, values: memoryview) -> dict[str
     if not index:
         return {}
     count = int.from_bytes(index[:2])
-    if count > MOST_ENTRIES or len(index) < 2 + count * ENTRY.size:
-        raise _fault(header, f"metadata of {len(index)} bytes with at most {MOST_ENTRIES} entries", f"{count}")
+    most_entries = 1000  # of the metadata
+    if count > most_entries or len(index) < 2 + count * ENTRY.size:
+        raise _fault(header, f"metadata of {len(index)} bytes with at most {most_entries} entries", f"{count}")
     found, at = {}, 0
     for key_size, code, value_size in ENTRY.iter_unpack(index[2 : 2 + count * ENTRY.size]):
         middle, end = at + key_size, at + key_size + value_size

@@ -22,7 +22,6 @@ TYPES = {2: "i1", 3: "u1", 4: "i2", 5: "u2", 6: "i4", 7: "u4", 10: "f4", 11: "f8
 BIG, LITTLE = 1, 2
 RAS, LPS = 1, 2
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
-LONGEST = 0xFFFF  # side, px
 UNPLACED = np.eye(4)  # millimetres a pixel, from the first one's centre
 
 
@@ -50,7 +49,8 @@ def write(image: Image) -> bytes:
     levels = image.levels if image.levels.ndim != 2 else image.levels[None]
     depth, height, width, channels = (*levels.shape, 1)[:4] if levels.ndim in (3, 4) else (0, 0, 0, 0)
     code = next((code for code, name in TYPES.items() if levels.dtype.newbyteorder("=") == np.dtype(name)), None)
-    if code is None or not 1 <= channels <= 255 or not 0 < min(depth, height, width) <= max(depth, height, width) <= LONGEST:
+    longest = 0xFFFF  # side, px
+    if code is None or not 1 <= channels <= 255 or not 0 < min(depth, height, width) <= max(depth, height, width) <= longest:
         raise InputError(f"expected an image or a volume of numbers, found {image.levels.shape} {levels.dtype}")
     if np.shape(image.ras_from_index) != (4, 4):
         raise InputError(f"expected a matrix of 4 x 4 as the image's place, found {np.shape(image.ras_from_index)}")

@@ -27,7 +27,6 @@ ROWS = 12  # numbers of a transform: its columns, less the last row
 TOOL = struct.Struct(f">20sBx{4 * ROWS}s")
 TURNED_TOOL = struct.Struct(">20sBx28s")  # with a quaternion
 POINT = struct.Struct(">64s32s4B3ff20s")
-MOST_RECORDS = 10_000  # tools or points, each of which takes some kB to read
 PLACES = {12: 3, 24: 6, 28: 7}  # numbers of a POSITION, by its bytes: place, and three or all of a quaternion's
 
 
@@ -245,8 +244,9 @@ def _whole(content: memoryview, size: int) -> memoryview:
 
 
 def _records(content: memoryview, size: int) -> list[memoryview]:
-    if len(content) % size or len(content) > MOST_RECORDS * size:
-        raise InputError(f"expected at most {MOST_RECORDS} records of {size} bytes, found {len(content)} bytes")
+    most_records = 10_000  # tools or points, each of which takes some kB to read
+    if len(content) % size or len(content) > most_records * size:
+        raise InputError(f"expected at most {most_records} records of {size} bytes, found {len(content)} bytes")
     return [content[at : at + size] for at in range(0, len(content), size)]
 
 

@@ -11,7 +11,6 @@ from recon.devices.openigtlink import igtl_header
 from recon.errors import InputError
 
 HEAD = struct.Struct(">10I")  # points; number and bytes of vertices, lines, polygons and strips; attributes
-MOST_CELLS = 100_000  # other than triangles, which are read one by one
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,9 @@ def _triangles(
     """Triangles of cells, each of which is its number of corners and these."""
     if len(numbers) == 4 * count and (numbers[::4] == 3).all():
         return numbers.reshape(-1, 4)[:, 1:]
-    if count > MOST_CELLS:
-        raise InputError(f"expected at most {MOST_CELLS} polygons that aren't triangles, found {count}")
+    most_cells = 100_000  # other than triangles, which are read one by one
+    if count > most_cells:
+        raise InputError(f"expected at most {most_cells} polygons that aren't triangles, found {count}")
     found = [parted(cell) for cell in _cells(numbers, count)]
     return np.concatenate([np.empty((0, 3), np.int64), *found])
 

@@ -29,11 +29,7 @@ PORT = 18944  # registered for OpenIGTLink
 MOST_CLIENTS = 16
 MOST_NAMES = 256  # pairs of kind and device, of each of which a message is held
 STALLED_S = 30.0  # for one message, after which a client that takes nothing is dropped
-UNSENT_BYTES = 1 << 18  # in the system's memory: what lies there is no longer the newest
-PIECE = 1 << 16  # bytes that are read at once
 LOOK_S = 0.5  # between two looks at whether to end
-MOST_QUERY_BYTES = 1 << 16
-QUERIES = ("GET_", "STT_", "STP_")
 
 Key = tuple[str, str]  # kind and device
 Answer = Callable[[Message], Mapping[Key, bytes]]
@@ -152,7 +148,8 @@ class _Client:
     ) -> None:
         connection.settimeout(STALLED_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, UNSENT_BYTES)
+        unsent_bytes = 1 << 18  # in the system's memory: what lies there is no longer the newest
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, unsent_bytes)
         self._connection, self._name, self._answer, self._complaints = connection, name, answer, complaints
         self._waiting = dict(first)
         self._change = threading.Condition()  # of the two beside it
@@ -207,8 +204,9 @@ class _Client:
 
     def _read(self, splitter: Splitter, pace: Pace) -> None:
         """Read once and answer what is asked."""
+        piece = 1 << 16  # bytes that are read at once
         try:
-            data = self._connection.recv(PIECE)
+            data = self._connection.recv(piece)
         except TimeoutError:  # a client need not say anything
             return
         if not data:
@@ -225,7 +223,9 @@ class _Client:
 
 
 def _is_query(header: Header) -> bool:
-    return header.kind.startswith(QUERIES) and header.size <= MOST_QUERY_BYTES
+    most_query_bytes = 1 << 16
+    queries = ("GET_", "STT_", "STP_")
+    return header.kind.startswith(queries) and header.size <= most_query_bytes
 
 
 def _listener(host: str, port: int) -> socket.socket:

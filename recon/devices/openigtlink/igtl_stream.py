@@ -12,10 +12,8 @@ from recon.devices.openigtlink.igtl_header import HEADER, MOST_BODY_BYTES, Heade
 from recon.devices.openigtlink.igtl_messages import Message
 from recon.errors import InputError
 
-MOST_PORT = 65535
 MOST_MESSAGES_S = 2000  # of a peer: twenty times what a rig sends
 MOST_BYTES_S = 512 << 20  # of a peer
-MOST_BAD = 10  # damaged messages one after the other, after which the peer is given up
 SILENT_S = 30.0  # in which nothing is said twice
 MOST_LINES = 10  # in that time
 
@@ -27,8 +25,9 @@ def any_kind(header: Header) -> bool:
 
 def checked_port(port: int, least: int = 1) -> int:
     """A port's number, if it is one; DeviceError if not."""
-    if not least <= port <= MOST_PORT:
-        raise DeviceError(f"OpenIGTLink: port: expected {least} to {MOST_PORT}, found {port}")
+    most_port = 65535
+    if not least <= port <= most_port:
+        raise DeviceError(f"OpenIGTLink: port: expected {least} to {most_port}, found {port}")
     return port
 
 
@@ -92,11 +91,12 @@ class Splitter:
             self._skipped = header.size
 
     def _message(self, header: Header, body: bytes) -> Message | InputError:
+        most_bad = 10  # damaged messages one after the other, after which the peer is given up
         try:
             found = igtl_messages.unpack(header, igtl_header.checked(header, body) if self._check else body)
         except InputError as error:
             self._bad += 1
-            if self._bad > MOST_BAD:
+            if self._bad > most_bad:
                 raise InputError(f"{self._bad} damaged messages one after the other, the last: {error}") from None
             return error
         self._bad = 0

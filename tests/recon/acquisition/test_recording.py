@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from recon.acquisition import growing_table, recording
+from recon.acquisition import recording
 from recon.capture import sweep_tables
 from recon.capture.board_part import read_board
 from recon.capture.images import read_image
@@ -147,7 +147,7 @@ def test_a_torn_row_is_mended_and_said(tmp_path, rng, caplog):
 
 
 def test_a_full_disk_leaves_the_rows_before(tmp_path, monkeypatch):
-    table = growing_table.GrowingTable(tmp_path / "timestamps.csv")
+    table = recording.GrowingTable(tmp_path / "timestamps.csv")
     table.append(0, 5)
     write = os.write
     monkeypatch.setattr(os, "write", lambda file, row: write(file, row[:2]))

@@ -19,7 +19,7 @@ from recon.devices.camera_pairs import CameraPair
 from recon.devices.interfaces import DeviceError, Frame
 from recon.devices.timed_frames import TimedScanner
 from tests.recon.acquisition.stand_ins import Scripted
-from twin.devices.virtual_operator import OneTake
+from twin.devices.virtual_session import OneTake
 from twin.devices.virtual_sweep import FramePair
 
 SIZE = (32, 24)

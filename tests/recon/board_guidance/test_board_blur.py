@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.board_guidance.board_blur import blur
+from recon.board_guidance.pose_verdict import board_blur
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.boards import Chessboard
@@ -25,8 +25,8 @@ def photographed(board, rng):
 def test_defocus_is_measured(rng, board):
     """Widths add in squares; the photograph has one of its own. A chessboard's edges don't lie across all directions."""
     image, pixels = photographed(board, rng)
-    own = blur(image, pixels).least
-    found = blur(cv2.GaussianBlur(image, (0, 0), 2.0), pixels)
+    own = board_blur(image, pixels).least
+    found = board_blur(cv2.GaussianBlur(image, (0, 0), 2.0), pixels)
     assert own < 1.5
     assert found.least == pytest.approx(np.hypot(2.0, own), rel=0.2)
     assert found.most < 1.6 * found.least
@@ -36,6 +36,6 @@ def test_motion_shows_in_its_direction_alone(rng):
     """A way of 12 px during the exposure lowers the steepest slope to contrast / 12 px along it."""
     image, pixels = photographed(BOARD, rng)
     kernel = np.full((1, 12), 1 / 12)
-    found = blur(cv2.filter2D(image, -1, kernel), pixels)
+    found = board_blur(cv2.filter2D(image, -1, kernel), pixels)
     assert found.least < 1.5
     assert found.most == pytest.approx(12 / np.sqrt(2 * np.pi), rel=0.25)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from recon.errors import InputError
-from recon.files import atomic, renaming
+from recon.files import atomic
 from recon.files.written_files import LIST
 
 
@@ -170,7 +170,7 @@ def write_both(root: Path, text: str) -> None:
 def test_an_error_while_folders_change_places_leaves_both_of_one_age(tmp_path, monkeypatch, calls, done):
     """Before or after any of the renamings: the old ones, or the new ones once the last is in its place, and nothing else."""
     write_both(tmp_path, "first")
-    count, rename, exchange = itertools.count(), Path.rename, renaming.exchange
+    count, rename, swap = itertools.count(), Path.rename, atomic.swap
 
     def or_raise(work):
         def worked(*given):
@@ -185,7 +185,7 @@ def test_an_error_while_folders_change_places_leaves_both_of_one_age(tmp_path, m
         return worked
 
     monkeypatch.setattr(Path, "rename", or_raise(rename))
-    monkeypatch.setattr(renaming, "exchange", or_raise(exchange))
+    monkeypatch.setattr(atomic, "swap", or_raise(swap))
     with pytest.raises(OSError, match="Input/output error"):
         write_both(tmp_path, "second")
     assert names(tmp_path) == ["capture", "truth"]
@@ -238,13 +238,13 @@ def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomic
     program = f"""
 import itertools, os
 from pathlib import Path
-from recon.files import atomic, renaming
+from recon.files import atomic
 from recon.files.written_files import LIST
-count, rename, exchange = itertools.count(), Path.rename, renaming.exchange
+count, rename, swap = itertools.count(), Path.rename, atomic.swap
 def or_die(work):
     return lambda *given: os._exit(9) if next(count) == {calls} else work(*given)
 Path.rename = or_die(rename)
-renaming.exchange = or_die(exchange) if {atomically} else lambda *given: False
+atomic.swap = or_die(swap) if {atomically} else lambda *given: False
 with atomic.new_folders({{Path("truth"): "mark", Path("capture"): "mark"}}) as folders:
     for folder in folders:
         (folder / "mark").write_text("second")

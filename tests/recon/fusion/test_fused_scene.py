@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.files import layers, meshes
+from recon.files import meshes
 from recon.fusion import fused_scene
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -27,8 +27,8 @@ def test_a_b_scan_lies_where_it_was_taken():
 def test_a_viewers_file_has_the_layers_by_name_in_metres_and_images_the_right_way_up(tmp_path):
     """In glTF, v of a texture grows downwards from the image's upper edge, as a B-scan's depth does."""
     scan = fused_scene.scan_layer(np.zeros((30, 20), np.uint8), np.diag([1.0, 1.0, 1.0, 1.0]))
-    mass = layers.painted(trimesh.creation.icosphere(radius=5.0), fused_scene.MASS)
-    layers.write_layers(tmp_path / "scene.glb", {"scan0000": scan, "mass0": mass})
+    mass = meshes.painted(trimesh.creation.icosphere(radius=5.0), fused_scene.MASS)
+    meshes.write_layers(tmp_path / "scene.glb", {"scan0000": scan, "mass0": mass})
     data = (tmp_path / "scene.glb").read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
     content, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -82,7 +82,7 @@ def test_b_scans_are_chosen_evenly_from_those_with_a_pose(count, expected):
 def test_a_viewers_file_has_the_skins_grey(tmp_path):
     ball = trimesh.creation.icosphere(4, 30.0)
     meshes.set_greys(ball, np.full(len(ball.vertices), 90, np.uint8))
-    layers.write_layers(
+    meshes.write_layers(
         tmp_path / "scene.glb", {"skin": fused_scene.surface_layer(ball, fused_scene.SKIN, fused_scene.GREY_SKIN)}
     )
     data = (tmp_path / "scene.glb").read_bytes()

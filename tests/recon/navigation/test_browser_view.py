@@ -13,10 +13,9 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.navigation import browser_view
 from recon.navigation.browser_view import LOOPBACK, BrowserView
-from recon.navigation.latencies import Latency
 from recon.navigation.mass_distances import MassDistance, bodies_of, distances
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.publishing import Moment, StillScene
+from recon.navigation.publishing import Latency, Moment, StillScene
 from tests.recon.navigation import headless_browser
 
 pytest.importorskip("viser")

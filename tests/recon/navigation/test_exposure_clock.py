@@ -4,7 +4,7 @@ import numpy as np
 
 from recon.devices.device_clocks import ClockFollower
 from recon.devices.interfaces import Frame
-from recon.navigation.exposure_clock import FollowedClock
+from recon.navigation.feeds import FollowedClock
 
 OFFSET_NS, LEAST_NS = 7 * 10**15, 8_000_000
 

@@ -7,10 +7,9 @@ from recon.devices.openigtlink.igtl_client import Client
 from recon.devices.openigtlink.igtl_server import LOOPBACK, Server
 from recon.freehand import sequences
 from recon.geometry import rigid
-from recon.navigation.igtl_sender import IgtlSender
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Moment, StillScene
-from recon.navigation.slicer_publisher import SlicerPublisher
+from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from tests.recon import probe_motions
 
 POSE = rigid.from_rotation_vector([2.8, 0.3, -0.4], [30, -12, 655])

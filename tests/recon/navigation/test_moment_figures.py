@@ -5,11 +5,10 @@ import re
 import numpy as np
 
 from recon.geometry import rigid
-from recon.navigation.latencies import Latency
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.moment_figures import html_of
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.publishing import Moment
+from recon.navigation.publishing import Latency, Moment
 
 POSE = rigid.transform(np.eye(3), [0, 0, 640])
 SCAN = PlacedScan(np.zeros((120, 80), np.uint8), 1, 10**9, np.eye(4))

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from recon.geometry.camera import Camera
-from recon.skin_projection import expected_view, skin_curve
+from recon.skin_projection import projector_image, skin_curve
 from recon.skin_projection.lines_of_sight import Sight, first_hits
 from recon.skin_projection.projector_image import Line, Lines, coverage, draw, visible
 from recon.skin_projection.skin_curve import laid
@@ -106,6 +106,6 @@ def test_a_camera_is_expected_to_see_what_is_lit_alone():
     dark[:, : round(device.project(np.array([[0.0, 0.0, PLANE_MM]]))[0, 0])] = True
     drawing = draw([line], skin, device, dark=dark)
     camera = Camera(device.size, device.matrix, np.zeros(5), np.eye(4))
-    seen = expected_view.expected([line], drawing.lit, skin, camera, Lines()) > 200
+    seen = projector_image.expected_view([line], drawing.lit, skin, camera, Lines()) > 200
     ends = camera.project(np.array([[x, 0.0, PLANE_MM] for x in (0.0, 20.0)]))[:, 0]
     assert abs(np.flatnonzero(seen.any(axis=0))[0] - ends[0]) < 3 and abs(np.flatnonzero(seen.any(axis=0))[-1] - ends[1]) < 3
