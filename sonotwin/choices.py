@@ -1,6 +1,7 @@
 """Read a rig or a pattern sequence of `conf/` by its name, or one of the user's own from a YAML file."""
 
 from pathlib import Path
+from typing import Any
 
 from recon.errors import InputError, did_you_mean, short, validated
 from recon.model.patterns import Patterns
@@ -21,14 +22,17 @@ def read_rig(source: str | Path = "meza2021") -> Rig:
     InputError
         If there is no such file, it is not YAML, or a field is wrong.
     """
-    path = file_of("rig", source)
-    return validated(Rig, config.read_choice("rig", path), path)
+    return validated(Rig, read("rig", source), file_of("rig", source))
 
 
 def read_patterns(source: str | Path = "paper_surface") -> Patterns:
     """Read a pattern sequence, by a name from `conf/patterns` or by the path of a YAML file; raises as `read_rig` does."""
-    path = file_of("patterns", source)
-    return validated(Patterns, config.read_choice("patterns", path), path)
+    return validated(Patterns, read("patterns", source), file_of("patterns", source))
+
+
+def read(group: str, source: str | Path, field: str = "") -> dict[str, Any]:
+    """Content of a choice, by its name in the group or by the path of a YAML file; raises as `read_rig` does."""
+    return config.read_choice(group, file_of(group, source, field))
 
 
 def file_of(group: str, source: str | Path, field: str = "") -> Path:

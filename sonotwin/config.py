@@ -257,11 +257,11 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
     return {str(key): value for key, value in result.items()}
 
 
-def defaults(verb: str) -> dict[str, Any]:
-    """The fields of a verb as they are without overrides; `???` where one needs a value."""
+def defaults(verb: str, overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """The fields of a verb as they are without overrides, or with those of a file; `???` where one needs a value."""
     from omegaconf import OmegaConf
 
-    found = OmegaConf.to_container(_composed(verb, ()), resolve=True)
+    found = OmegaConf.to_container(_composed(verb, overrides), resolve=True)
     assert isinstance(found, dict)
     return {str(key): value for key, value in found.items()}
 

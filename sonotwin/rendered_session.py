@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from recon.model.rig import Positive
 from scenes.acoustics import made_of
-from sonotwin import choices, config
+from sonotwin import choices
 from sonotwin.verbs import render, sweep
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
@@ -84,14 +84,18 @@ def parts(chosen: Settings, out: Path, bottom_hz: float = inf) -> Iterator[Rende
         yield Rendering("board", f"render the calibration board in {chosen.poses.count} poses", "render", board(chosen, out))
     if not chosen.looks_inside:
         return
-    rests, clocks = choice("path", "wire"), chosen.clocks
-    wires = {"scene": choice("scene", "crosswire"), "ultrasound": _in_water(chosen), "path": rests | {"count": chosen.wires}}
+    rests, clocks = choices.read("path", "wire"), chosen.clocks
+    wires = {
+        "scene": choices.read("scene", "crosswire"),
+        "ultrasound": _in_water(chosen),
+        "path": rests | {"count": chosen.wires},
+    }
     resting = clocks.model_copy(update={"camera_hz": RESTING_HZ})
     yield _swept(
         chosen, out, WIRES, f"render {chosen.wires} B-scans of crossed wires, and frames of both cameras", wires, resting
     )
-    bob = choice("path", "bob") | {"seconds": chosen.bottom_s}
-    bottom = {"scene": choice("scene", "tank"), "ultrasound": _in_water(chosen), "path": bob}
+    bob = choices.read("path", "bob") | {"seconds": chosen.bottom_s}
+    bottom = {"scene": choices.read("scene", "tank"), "ultrasound": _in_water(chosen), "path": bob}
     slower = clocks.model_copy(update={"camera_hz": min(clocks.camera_hz, bottom_hz)})
     yield _swept(chosen, out, BOTTOM, "render a flat bottom, up and down", bottom, slower)
     scan = {"scene": chosen.scene, "ultrasound": chosen.ultrasound, "path": chosen.path}
@@ -103,7 +107,7 @@ def board(chosen: Settings, out: Path, add: bool = True) -> render.Config:
     assert chosen.poses is not None
     shooting = chosen.shooting.model_copy(update={"exposure_s": None})
     own = {
-        "scene": choice("scene", "board"),
+        "scene": choices.read("scene", "board"),
         "patterns": choices.read_patterns("paper_calibration"),
         "cameras": ["cam1", "cam2"],
     }
@@ -123,11 +127,11 @@ def cylinders(chosen: Settings, out: Path) -> Iterator[Rendering]:
     Light measures the outer one; then that is taken away, and ultrasound measures the inner one, which stays where it is, in
     water, in 94 B-scans as in Meza et al. 2021.
     """
-    outer = chosen.model_copy(update={"scene": choice("scene", "cylinders")})
+    outer = chosen.model_copy(update={"scene": choices.read("scene", "cylinders")})
     yield Rendering("render", "render images of the outer cylinder", "render", skin(outer, out))
     along = {"start_mm": (-19.35, -2), "end_mm": (27.35, -2), "turn_deg": 90, "standoff_mm": 17}
-    scene = choice("scene", "inner_cylinder") | {"centre_mm": list(INNER_MM)}
-    fields = {"scene": scene, "ultrasound": _in_water(chosen), "path": choice("path", "stroke") | along}
+    scene = choices.read("scene", "inner_cylinder") | {"centre_mm": list(INNER_MM)}
+    fields = {"scene": scene, "ultrasound": _in_water(chosen), "path": choices.read("path", "stroke") | along}
     clocks = chosen.clocks.model_copy(update={"camera_hz": TANK_HZ})
     yield _swept(chosen, out, TUBE, "render a sweep along the inner cylinder", fields, clocks)
 
@@ -144,11 +148,6 @@ def _shared(chosen: Settings) -> dict:
 
 def _in_water(chosen: Settings) -> Transducer:
     """The scanner as it is set for water, its images as over the scene."""
-    in_water = Transducer.model_validate(choice("ultrasound", "water"))
+    in_water = Transducer.model_validate(choices.read("ultrasound", "water"))
     same = {"image_size": chosen.ultrasound.image_size, "scale_mm_per_px": chosen.ultrasound.scale_mm_per_px}
     return Transducer.model_validate(in_water.model_dump() | same)
-
-
-def choice(group: str, name: str) -> dict:
-    """The fields of a choice of conf/."""
-    return config.read_choice(group, choices.file_of(group, name))

@@ -20,9 +20,9 @@ from recon.files.metrics import Metrics, shown
 from recon.probe_calibration import repeatability
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from recon.session import optics_step, plan, probe_step
-from sonotwin import config, rendered_session
+from sonotwin import choices, config, rendered_session
 from sonotwin.choices import read_rig
-from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings, choice
+from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings
 from sonotwin.verbs import reconstruct
 from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import session_errors
@@ -99,7 +99,7 @@ def settings(conditions: str, seed: int) -> Settings:
     groups = {"rig": RIG, "scene": "breast", "patterns": "paper_surface", "tracing": "default", "poses": POSES, "path": "raster"}
     groups |= {"ultrasound": "linear", "conditions": conditions}
     own = {"cameras": ["cam1"], "shooting": {}, "clocks": Clocks(), "wires": 40, "bottom_s": 6.0, "seed": seed, "out": "session"}
-    return Settings.model_validate({group: choice(group, name) for group, name in groups.items()} | own)
+    return Settings.model_validate({group: choices.read(group, name) for group, name in groups.items()} | own)
 
 
 def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Path) -> reconstruct.Config:

@@ -6,16 +6,18 @@ goes on where it was.
 
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from recon.errors import InputError
-from sonotwin import study_plan, study_steps
+from sonotwin import choices, study_plan, study_steps
 from sonotwin.choices import read_rig
-from sonotwin.config import load
-from sonotwin.verbs.study import Config
+from sonotwin.verbs.study import Config, of_conf
 from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.engine import Engine
+from twin.optics.surface_session import Shooting
 from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
 from twin.studies.study_runs import TABLE, Done, finite
 
@@ -23,7 +25,7 @@ RIG = "meza2021"
 SEEDS = 3
 BUDGET_SEEDS = 24  # a second each; a contribution is then known to 14 %
 PAPER = ("optics", "planes", "sphere", "probe", "cylinders", "breast")
-POSES = "poses=demo"  # of the board: 10 instead of 34
+POSES = "demo"  # of the board: 10 instead of 34
 EXPLORATIONS = ("phase_steps", "fringe_pitch", "projector_distance", "exposure", "board_poses", "target_size")
 SEARCHED = {  # a smaller space than that of conf/study/better_rig.yaml, which is searched whole too
     "patterns.parts.fringes.pitch": [6, 9, 12, 18, 27],
@@ -31,7 +33,7 @@ SEARCHED = {  # a smaller space than that of conf/study/better_rig.yaml, which i
     "layout.projector_mm": [60, 100, 165, 220],
 }
 POOR = {"patterns.parts.fringes.pitch": 27, "patterns.parts.fringes.steps": 4, "layout.projector_mm": 60}
-DARK = "shooting.exposure_s=0.004"
+DARK = Shooting(exposure_s=0.004)
 BOUNDS = {"images_s": {"most": 0.03}, "coverage": {"least": 0.9}}
 WORKERS = 2
 
@@ -56,10 +58,9 @@ def measurements(setup: Setup) -> list[Measurement]:
     ]
 
 
-def study(kept: Path, name: str, *fields: str) -> tuple[Config, list[Done]]:
+def study(kept: Path, name: str, **fields: Any) -> tuple[Config, list[Done]]:
     """A study of conf/study with fields of its own, its trials done or kept."""
-    place = [f"out={kept / name}", f"trials={kept / 'trials'}", f"engine.workers={WORKERS}"]
-    config = load("study", [f"name={name}", *place, *fields], Config)
+    config = of_conf(name, kept / name, trials=kept / "trials", engine=Engine(workers=WORKERS), **fields)
     if config.budget is not None:
         points = error_budget.points(config.budget, config.settings.model_dump(mode="json")).values()
     else:
@@ -70,9 +71,9 @@ def study(kept: Path, name: str, *fields: str) -> tuple[Config, list[Done]]:
 
 def laboratories(kept: Path) -> list[Row]:
     """Rows a and b: the paper's figures under lifelike conditions, by our method and by the paper's."""
-    rows = []
+    rows, few = [], choices.read("poses", POSES)
     for name in PAPER:
-        config, done = study(kept, name, f"seeds={SEEDS}", POSES, "over={conditions: [lifelike]}")
+        config, done = study(kept, name, seeds=SEEDS, poses=few, over={"conditions": ["lifelike"]})
         for one in beside_paper.compare(config.beside, done):
             what, unit = one.figure.what, one.figure.unit
             if one.figure.bar is not None:
@@ -90,7 +91,7 @@ def laboratories(kept: Path) -> list[Row]:
 
 def budget(kept: Path) -> list[Row]:
     """Row c: sums of parts against the whole, and predictions against switching."""
-    config, done = study(kept, "budget", f"seeds={BUDGET_SEEDS}")
+    config, done = study(kept, "budget", seeds=BUDGET_SEEDS)
     assert config.budget is not None
     points = error_budget.points(config.budget, config.settings.model_dump(mode="json"))
     size, rows = config.seeds, []
@@ -107,8 +108,7 @@ def budget(kept: Path) -> list[Row]:
 
 def exploration(kept: Path, name: str) -> list[Row]:
     """Row d: figures of an exploration over what they are held against, the median over its trials and the largest."""
-    fields = ["poses=demo"] if name == "board_poses" else []
-    config, done = study(kept, name, f"seeds={SEEDS}", *fields)
+    config, done = study(kept, name, seeds=SEEDS, **({"poses": choices.read("poses", POSES)} if name == "board_poses" else {}))
     rows = []
     of = experiments.experiment(config.of)
     for figure, limit in of.limits.items():
@@ -122,9 +122,7 @@ def exploration(kept: Path, name: str) -> list[Row]:
 
 def search(kept: Path) -> list[Row]:
     """Row e: a search from a poor rig against all combinations."""
-    over = "over={" + ", ".join(f"{field}: {values}" for field, values in SEARCHED.items()) + "}"
-    fields = ["of=surface", over, "seeds=1", DARK]
-    config, done = study(kept, "sweep", *fields)
+    config, done = study(kept, "sweep", of="surface", over=SEARCHED, seeds=1, shooting=DARK)
     read = factors.read(config.over)
     runs = len(done) // 4
     goal = rig_search.Goal.model_validate({"least": "plane_rms_mm", "runs": runs, "start": POOR, "bounds": BOUNDS})
@@ -140,11 +138,12 @@ def search(kept: Path) -> list[Row]:
 def engines(kept: Path) -> list[Row]:
     """Row f: tables of one process, two processes and Dask, byte by byte."""
     tables = []
-    for number, engine in enumerate((["engine.workers=1"], ["engine.workers=2"], ["engine=dask"])):
-        place = kept / f"engine{number}"
-        fields = ["name=sweep", "of=surface", "over={shooting.exposure_s: [0.004, 0.016]}", "seeds=1", f"out={place}", *engine]
-        config = load("study", fields, Config)
-        study_steps.sweep(config, Console(quiet=True))
+    for number, engine in enumerate((Engine(workers=1), Engine(workers=2), Engine(name="dask", workers=2))):
+        place, over = kept / f"engine{number}", {"shooting.exposure_s": [0.004, 0.016]}
+        config = of_conf("sweep", place, of="surface", over=over, seeds=1, engine=engine)
+        trials = study_plan.trials(config.of, config.settings, study_steps.design(config), study_steps.seeds(config))
+        folder = study_steps.opened(config)
+        folder.write_table(study_steps.do(config, folder, trials, Console(quiet=True)))
         tables.append((place / TABLE).read_bytes())
     alike = float(all(table == tables[0] for table in tables))
     what = "tables by one process, two processes and Dask's workers are the same bytes"

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
@@ -11,7 +10,6 @@ from recon.errors import InputError, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
 from sonotwin import choices
-from sonotwin.config import folder, read_choice
 from twin.studies import experiments, factors, study_runs
 from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
@@ -88,16 +86,12 @@ def choice(name: str, value: str) -> Any:
 
     A YAML file of one's own is a choice, too: `ours.yaml`, `ours.yaml.sound`.
     """
-    group = GROUPS[name.split(factors.JOINT)[0]]
-    own = re.match(r"(.+\.ya?ml)(?:\.(.+))?$", value)
-    file, part = (own[1], own[2]) if own else value.partition(".")[::2]
-    path = Path(file) if own else folder() / group / f"{file}.yaml"
-    if not path.is_file():
-        names = ", ".join(sorted(each.stem for each in (folder() / group).glob("*.yaml")))
-        raise InputError(f"over: {name}: expected one of {names}, or a YAML file, found {value}")
-    content = read_choice(group, path)
+    whole = re.match(r".+\.ya?ml(?=\.|$)|[^.]*", value)
+    assert whole is not None
+    source, part = whole[0], value[whole.end() + 1 :]
+    content = choices.read(GROUPS[name.split(factors.JOINT)[0]], source, f"over: {name}")
     if not part:
         return content
     if part not in content:
-        raise InputError(f"over: {name}: expected {file}, or a part of it, {', '.join(content)}, found {value}")
+        raise InputError(f"over: {name}: expected {source}, or a part of it, {', '.join(content)}, found {value}")
     return {part: content[part]}

@@ -21,7 +21,7 @@ from rich.console import Console
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Rig
 from sonotwin import study_steps
-from sonotwin.config import compose, folder
+from sonotwin.config import compose, defaults, folder
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
 from twin.engine import Engine
 from twin.studies.beside_paper import Figure
@@ -61,7 +61,7 @@ class Config(Part):
             return given
         overrides = tuple((info.context or {}).get("overrides", ()))
         study = read_study(given["name"])
-        if study is not None and study.fields:
+        if study is not None and study.fields and overrides:
             given = compose("study", [*study.fields, *overrides])
         own = {} if study is None else study.model_dump(exclude={"fields"})
         ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
@@ -95,6 +95,19 @@ def _on_raster(settings: Mapping[str, Any]) -> dict[str, Any]:
         return {name: patterns.on(size) for name, patterns in named.items()}
     except ValidationError:
         return {}
+
+
+def of_conf(name: str, out: Path, **fields: Any) -> Config:
+    """A study of conf/study, or a sweep, with fields of its own, of the study or of the experiment's settings, as objects.
+
+    Raises
+    ------
+    InputError
+        If there is no such study.
+    """
+    study = read_study(name)
+    composed = defaults("study", () if study is None else study.fields)
+    return Config.model_validate(composed | {"name": name, "out": out} | fields)
 
 
 def run(config: Config) -> int:

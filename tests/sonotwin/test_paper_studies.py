@@ -2,10 +2,13 @@
 
 import pytest
 
-from sonotwin import study_accuracy
+from sonotwin import choices, study_accuracy
 from twin.studies import beside_paper
+from twin.studies.drawn_session import ROLL_DEG
+from twin.ultrasound.probe_path import WirePath
 
-FEW = ["over={conditions: [lifelike]}", "seeds=1", "first_seed=3", "poses.count=8"]
+FEW = {"over": {"conditions": ["lifelike"]}, "seeds": 1, "first_seed": 3}
+POSES = choices.read("poses", "paper")
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +20,7 @@ def kept(tmp_path_factory):
 @pytest.mark.parametrize("name", ["planes", "sphere"])
 def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
     """Under lifelike conditions; where noise limits a figure, ours is within a fourth of that."""
-    config, done = study_accuracy.study(kept, name, *FEW)
+    config, done = study_accuracy.study(kept, name, **FEW, poses=POSES | {"count": 8})
     compared = beside_paper.compare(config.beside, done)
     assert len(compared) == len(config.beside) and all(one.bar_met for one in compared)
     assert all(one.paper.max() > one.ours.max() for one in compared)
@@ -28,13 +31,13 @@ def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
 @pytest.mark.slow
 def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept):
     """Five calibrations of the probe with fewer poses than the paper's, and both cylinders."""
-    few = ["over={conditions: [lifelike]}", "seeds=1", "first_seed=3", "poses.count=12", "wire_path.count=18"]
-    (_, (one,)) = study_accuracy.study(kept, "probe", *few)
+    few = FEW | {"poses": POSES | {"count": 12}, "wire_path": WirePath(count=18, roll_deg=ROLL_DEG)}
+    (_, (one,)) = study_accuracy.study(kept, "probe", **few)
     figures = one.figures
     for figure in ("cr1_mean", "probe_error", "tube_diameter_error", "cover_diameter_error"):
         assert abs(figures[f"{figure}_ours_mm"]) < abs(figures[f"{figure}_paper_mm"])
     assert figures["cr1_mean_ours_mm"] < 2 * figures["cr1_mean_predicted_mm"]
     assert figures["equation_rms_paper_mm"] > 2 * figures["equation_rms_ours_mm"]
     trials = len(list((kept / "trials").glob("*.json")))
-    study_accuracy.study(kept, "cylinders", *few)
+    study_accuracy.study(kept, "cylinders", **few)
     assert len(list((kept / "trials").glob("*.json"))) == trials  # probe and cylinders are figures of the same laboratory
