@@ -65,7 +65,7 @@ def random_poses(config: Config, design: AsymmetricCircles, devices: Sequence[Ca
     return np.stack([_pose(config, k, draws[k], design, devices) for k in range(config.count)])
 
 
-def orientation(tilt_deg: float, draw: Array) -> Array:
+def _orientation(tilt_deg: float, draw: Array) -> Array:
     """Rotation : (3, 3) of a board from three numbers in [0, 1]: its turn in the plane, then how far and which way it tilts.
 
     Turns are drawn towards the quarters, for only a board that stands straight fills the corners of an image. Normals spread
@@ -96,7 +96,7 @@ def _pose(config: Config, k: int, draw: Array, design: AsymmetricCircles, device
     points = design.points()
     middle, hull, angles = (points.min(axis=0) + points.max(axis=0)) / 2, outline(design), draw[1:4]
     for _ in range(TRIES):
-        rotation = orientation(config.tilt_deg, angles)
+        rotation = _orientation(config.tilt_deg, angles)
         place = _place((hull - middle) @ rotation.T, depth, draw[4:], config.margin_px, devices)
         if place is not None:
             return rigid.transform(rotation, place - rotation @ middle)

@@ -39,7 +39,7 @@ class BoardPlan:
     seed: int = 0  # of the poses from which one is chosen
 
 
-class Outcome(NamedTuple):
+class _Outcome(NamedTuple):
     """What came of a pose that was held."""
 
     kept: bool
@@ -81,14 +81,14 @@ def record_board(recording: Recording, stage: Stage, operator: Operator, plan: B
 
 def _held(
     recording: Recording, session: StillSession, guide: BoardGuide, plan: BoardPlan, lit: Mapping[str, NDArray], whatever: bool
-) -> Outcome:
+) -> _Outcome:
     """Take a pose that is held, and keep it if nothing is wrong with it, or whatever is wrong if camera 1 can place it."""
     name = recording.next_pose
     sighting, faults = guide.sight(name, lit), session.faults(lit)
     verdict = guide.judge_lit(sighting, lit)
     reason = sentence(faults) or ("" if verdict.accepted else verdict.reason)
     if held(sighting, guide.so_far) is None:
-        return Outcome(False, f"not kept: {reason}")
+        return _Outcome(False, f"not kept: {reason}")
     if reason and not whatever:
         return _refused(reason)
     fringes, unlit = session.sequence(plan.shown, [FRINGE_CAMERA])
@@ -103,8 +103,8 @@ def _held(
         return _refused(reason)
     recording.add_pose(lit, fringes, plan.board, plan.patterns, session.devices(plan.patterns.projector_size))
     guide.accept(sighting, verdict)
-    return Outcome(True, f"kept though {reason}" if reason else verdict.reason)
+    return _Outcome(True, f"kept though {reason}" if reason else verdict.reason)
 
 
-def _refused(reason: str) -> Outcome:
-    return Outcome(False, f"not kept: {reason} (k takes the board as it is held, and keeps the pose)")
+def _refused(reason: str) -> _Outcome:
+    return _Outcome(False, f"not kept: {reason} (k takes the board as it is held, and keeps the pose)")

@@ -222,7 +222,7 @@ class Recording:
                 for leftover in (self.folder / folder).glob(".*.part"):
                     leftover.unlink()
                 table = self.folder / folder / manifest.STAMPS
-                if table.is_file() and (torn := mend_table(table)):
+                if table.is_file() and (torn := _mend_table(table)):
                     log.warning("%s: mended: the last row, of which %d bytes had been written, is left out", table, torn)
 
 
@@ -353,7 +353,7 @@ class GrowingTable:
         self._file = -1
 
 
-def mend_table(path: Path) -> int:
+def _mend_table(path: Path) -> int:
     """Cut a table after its last whole row; returns the number of bytes that went."""
     with path.open("r+b") as stream:
         content = stream.read()

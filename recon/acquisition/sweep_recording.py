@@ -74,7 +74,7 @@ class ScanSource(Scanner, Protocol):
         ...
 
 
-class Reader(Protocol):
+class _Reader(Protocol):
     """What reads the frames of one source."""
 
     def read(self, timeout_s: float) -> list[Taken] | None:
@@ -185,7 +185,7 @@ def record_sweep(
     return counts
 
 
-def _write_rest(reader: Reader, write: Callable[[Taken], None]) -> None:
+def _write_rest(reader: _Reader, write: Callable[[Taken], None]) -> None:
     """Write a reader's frames that waited for their times until the end."""
     for taken in reader.rest():
         write(taken)
@@ -230,7 +230,7 @@ def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan,
         sleep(POLL_S)
 
 
-def _readers(pairs: PairSource | None, scanner: ScanSource | None, say: Say) -> list[Reader]:
+def _readers(pairs: PairSource | None, scanner: ScanSource | None, say: Say) -> list[_Reader]:
     return [*([] if pairs is None else [_PairReader(pairs, say)]), *([] if scanner is None else [_ScanReader(scanner)])]
 
 

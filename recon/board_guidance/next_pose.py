@@ -65,7 +65,7 @@ def suggest(
     gains = known.gains(choice, few(board.points()))
     best = int(np.argmax(gains))
     camera = next(iter(known.cameras.values()))
-    rim, points = in_image(camera, choice[best], board)
+    rim, points = _in_image(camera, choice[best], board)
     return Suggestion(choice[best], rim, points, placed(choice[best], board), float(gains[best]), np.sqrt(known.variances))
 
 
@@ -101,7 +101,7 @@ def few(points: Array) -> Array:
     return points[np.unique(np.linspace(0, len(points) - 1, min(few_points, len(points))).round().astype(int))]
 
 
-def in_image(camera: Camera, pose: Array, board: Board) -> tuple[Array, Array]:
+def _in_image(camera: Camera, pose: Array, board: Board) -> tuple[Array, Array]:
     """A board's outline : (m, 2) px, closed, and its points : (n, 2) px in a camera's image."""
     rim = camera.project(rigid.apply(pose, outline(board)))
     return np.concatenate([rim, rim[:1]]), camera.project(rigid.apply(pose, board.points()))

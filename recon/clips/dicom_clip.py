@@ -69,7 +69,7 @@ def _clip(path: Path) -> Clip:
     if not 0 < size[0] * size[1] <= MOST_PX:
         raise ValueError(f"images of {size[0]}x{size[1]}")
     seconds, region = times(header, count), _b_scan_region(header)
-    image, scale = (None, None) if region is None else within(*region, size)
+    image, scale = (None, None) if region is None else _within(*region, size)
     timed = None if seconds is None else checked_seconds(path, seconds)
     return Clip(path.name, size, count, timed, lambda: images(path, size, count), image, scale)
 
@@ -211,7 +211,7 @@ def _b_scan_region(header: Dataset) -> tuple[Box, tuple[float, float] | None] | 
     return best
 
 
-def within(region: Box, scale: tuple[float, float] | None, size: tuple[int, int]) -> tuple[Box, tuple[float, float] | None]:
+def _within(region: Box, scale: tuple[float, float] | None, size: tuple[int, int]) -> tuple[Box, tuple[float, float] | None]:
     """A region less the pixel by which files that count from one overstep the image, and its scale.
 
     Farther beyond, the image is no longer the one that the region describes, and no scale of it is known.

@@ -20,7 +20,7 @@ PREDICTORS = range(1, 8)
 MOST_BITS = 16  # of a code, of a sample and of a difference
 
 
-class Frame(NamedTuple):
+class _Frame(NamedTuple):
     """The image that the markers describe."""
 
     precision: int  # bits of a sample
@@ -88,13 +88,13 @@ def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
         position = end
 
 
-def _frame(content: bytes) -> Frame:
+def _frame(content: bytes) -> _Frame:
     precision, height, width, count = struct.unpack(">BHHB", content[:6])
     if not (2 <= precision <= MOST_BITS and 0 < height * width <= MOST_PX and count in (1, 3) and len(content) == 6 + 3 * count):
         raise ValueError(f"a JPEG frame of {width}x{height} px, {precision} bits and {count} components")
     if count > 1 and any(content[7 + 3 * k] != content[7] for k in range(count)):
         raise ValueError("JPEG components of different sizes")
-    return Frame(precision, height, width, tuple(content[6 + 3 * k] for k in range(count)))
+    return _Frame(precision, height, width, tuple(content[6 + 3 * k] for k in range(count)))
 
 
 def _codes(content: bytes) -> dict[int, Codes]:
@@ -118,7 +118,7 @@ def _codes(content: bytes) -> dict[int, Codes]:
     return tables
 
 
-def _scan(content: bytes, frame: Frame, codes: dict[int, Codes]) -> tuple[list[int], NDArray[np.uint16], int, int]:
+def _scan(content: bytes, frame: _Frame, codes: dict[int, Codes]) -> tuple[list[int], NDArray[np.uint16], int, int]:
     """Places of a scan's components in the frame, their tables : (components, 65536), the predictor, and the bits left out."""
     count = content[0] if content else 0
     if not 1 <= count <= len(frame.names) or len(content) != 4 + 2 * count:

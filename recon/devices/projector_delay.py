@@ -18,7 +18,7 @@ FLASHES = 16  # black and white in turn
 LONGEST_S = 0.5  # that a projector may take, and a third more is watched
 
 
-class Watched(NamedTuple):
+class _Watched(NamedTuple):
     """Images after a flash."""
 
     seconds: NDArray[np.float64]  # (n,) begin of each exposure, or arrival of each image, after the flash was drawn
@@ -68,7 +68,7 @@ def frames_to_wait(
     return max(int(watched.numbers[first]) for watched, first in _settled(camera, series)) + 1
 
 
-def _settled(camera: Camera, series: list[Watched]) -> Iterator[tuple[Watched, int]]:
+def _settled(camera: Camera, series: list[_Watched]) -> Iterator[tuple[_Watched, int]]:
     """Each flash but the first, and the index of its first image from which on all show it."""
     ends = [float(np.median(watched.levels[-max(len(watched.levels) // 4, 1) :])) for watched in series]
     settled = 0.02  # share of a step up to which a level is the new one
@@ -89,7 +89,7 @@ def _settled(camera: Camera, series: list[Watched]) -> Iterator[tuple[Watched, i
         yield watched, first
 
 
-def _trigger(projector: Projector, camera: Camera, k: int, flashes: int) -> Watched:
+def _trigger(projector: Projector, camera: Camera, k: int, flashes: int) -> _Watched:
     """Flash k, watched by triggers as fast as the camera takes them."""
     frames, begins, begin = [], [], _flash(projector, k)
     while time.monotonic_ns() - begin < 1e9 * LONGEST_S * 4 / 3:
@@ -104,7 +104,7 @@ def _trigger(projector: Projector, camera: Camera, k: int, flashes: int) -> Watc
     return _watched(camera, frames, begins, begin)
 
 
-def _watch(projector: Projector, camera: Camera, k: int, flashes: int) -> Watched:
+def _watch(projector: Projector, camera: Camera, k: int, flashes: int) -> _Watched:
     """Flash k, watched by a camera that runs."""
     frames: list[Frame] = []
     begin = _flash(projector, k)
@@ -124,10 +124,10 @@ def _flash(projector: Projector, k: int) -> int:
     return projector.show(np.full((height, width), 0 if k % 2 else 255, np.uint8))
 
 
-def _watched(camera: Camera, frames: list[Frame], begins: list[int], begin: int) -> Watched:
+def _watched(camera: Camera, frames: list[Frame], begins: list[int], begin: int) -> _Watched:
     """Levels of frames; DeviceError without any."""
     if not frames:
         raise DeviceError(f"{camera.name}: expected images during a flash, found none: is it triggered, and its cable tight?")
     numbers = np.array([frame.number for frame in frames])
     levels = np.array([cv2.mean(frame.image)[0] for frame in frames])
-    return Watched((np.array(begins) - begin) / 1e9, numbers - numbers[0], levels)
+    return _Watched((np.array(begins) - begin) / 1e9, numbers - numbers[0], levels)

@@ -60,10 +60,10 @@ def measure(projector: Projector, camera: Camera, taking: Taking, steps: int = S
     for k, shot in zip(order, play(Stage(projector, {camera.name: camera}, taking), shown), strict=True):
         refuse_faults(shot)
         images[k] = shot.frames[camera.name].image
-    return response(levels / 255, [images[k] for k in range(steps)], 2**camera.bits - 1, camera.name)
+    return _response(levels / 255, [images[k] for k in range(steps)], 2**camera.bits - 1, camera.name)
 
 
-def response(levels: Array, images: Sequence[Image], full: float, name: str) -> Response:
+def _response(levels: Array, images: Sequence[Image], full: float, name: str) -> Response:
     """The response by images : (h, w) of ascending grey levels : (n,), black first and white last.
 
     full : DN of a saturated pixel

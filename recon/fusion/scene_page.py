@@ -48,7 +48,7 @@ def in_space(scene: FusedScene) -> Section:
     """The view, and its slider."""
     text = "Turn it with the mouse; a click in the legend shows or hides a part; the slider leads the probe along the sweep."
     reel = reel_of(scene)
-    shapes, lines = list(bodies(scene)), list(wires(scene))
+    shapes, lines = list(_bodies(scene)), list(_wires(scene))
     if reel is None:
         return Section("All in one frame", [page.view(VIEW, space_views.inside_view(shapes, lines, []), text)])
     first = len(reel.images) // 2
@@ -69,7 +69,7 @@ def reel_of(scene: FusedScene) -> Reel | None:
     return Reel(SCAN, images, scene.scans.world_from_pixel[numbers], moving, scene.world_from_target[numbers], labels)
 
 
-def bodies(scene: FusedScene) -> Iterator[Shape]:
+def _bodies(scene: FusedScene) -> Iterator[Shape]:
     """Everything that has a surface and rests."""
     for name, mesh, colour, opacity in (("skin", scene.skin, SKIN, 0.45), ("table", scene.rest, TABLE, 1.0)):
         if mesh is not None:
@@ -80,7 +80,7 @@ def bodies(scene: FusedScene) -> Iterator[Shape]:
         yield Shape(name, coarse.vertices, coarse.faces, MASS)
 
 
-def wires(scene: FusedScene) -> Iterator[Lines]:
+def _wires(scene: FusedScene) -> Iterator[Lines]:
     """The path of the array's face, and the devices' views."""
     if len(scene.path) > 1:
         yield Lines("path", scene.path[None], PATH)

@@ -32,7 +32,7 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
     scans : number of B-scans that are written
     """
     folder.mkdir()
-    for name, mesh in models(scene):
+    for name, mesh in _models(scene):
         meshes.write_ply(folder / f"{name}.ply", mesh)
     for name, path in voxels.items():
         shutil.copyfile(path, folder / f"{name}.nrrd")
@@ -49,7 +49,7 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
         shutil.copyfile(TEMPLATES / f"slicer_{name}.txt", folder / name)
 
 
-def models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
+def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
     """Models in the world, by the files' names."""
     if scene.skin is not None:
         yield "skin", scene.skin

@@ -43,7 +43,7 @@ class Refined:
     moved: Array  # (n,) mm outwards, of the vertices
 
 
-class Cells(NamedTuple):
+class _Cells(NamedTuple):
     """Places sorted into cubes; a row of cubes along z lies in one piece."""
 
     places: Array  # (n, 3) mm, sorted
@@ -83,7 +83,7 @@ def mix(places: Array, normals: Array, values: Array, patch_mm: float) -> Array:
     start = np.searchsorted(flat[order], np.arange(size.prod() + 1))
     rows = np.append(start[:-1].reshape(size), start[size[2] :: size[2]].reshape(*size[:2], 1), axis=2)
     result = np.empty_like(values)
-    cells, sorted_values, sums = Cells(places[order], normals[order], cube[order], rows), values[order], np.zeros_like(values)
+    cells, sorted_values, sums = _Cells(places[order], normals[order], cube[order], rows), values[order], np.zeros_like(values)
     in_threads(_mix, len(values), cells, sorted_values, (patch_mm, reach), sums)
     result[order] = sums
     return result
@@ -209,7 +209,7 @@ def _fill_misfits(first, end, profiles, weight, trials, plain, lined):
                 lined[place, n] = min(lined[place, n], _misfit_with_line(sums))
 
 
-class Sums(NamedTuple):
+class _Sums(NamedTuple):
     """Weighted sums over a profile y and the rows a, b, c of a trial."""
 
     yy: float
@@ -233,7 +233,7 @@ def _weighted_sums(trial, profile, weight):
         wy, wa, wb, wc = weight[s] * y, weight[s] * a, weight[s] * b, weight[s] * c
         yy, ay, by, cy = yy + wy * y, ay + wa * y, by + wb * y, cy + wc * y
         aa, ab, ac, bb, bc, cc = aa + wa * a, ab + wa * b, ac + wa * c, bb + wb * b, bc + wb * c, cc + wc * c
-    return Sums(yy, ay, by, cy, aa, ab, ac, bb, bc, cc)
+    return _Sums(yy, ay, by, cy, aa, ab, ac, bb, bc, cc)
 
 
 @njit(inline="always")

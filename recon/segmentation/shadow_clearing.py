@@ -40,7 +40,7 @@ class Recording:
 def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sound) -> EchoPower:
     """Average power anew, with each pixel at the place of its echo, and as bright as without the masses' shadows."""
     inside, scale = distances(masses, grid), pixel_mm(recording.world_from_pixel)
-    by_depth, by_path = losses(recording, inside, sound)
+    by_depth, by_path = _losses(recording, inside, sound)
     table, top = recording.table, recording.clip.v
 
     most_loss = 0.05  # of power left: darker pixels are left out
@@ -58,7 +58,7 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
     return echo_power.accumulated(placed, recording.world_from_pixel, grid)
 
 
-def losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, float]:
+def _losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, float]:
     """Loss of power, nepers a mm: of tissue with depth, beyond the scanner's gain; and of masses, beyond that of tissue.
 
     Fitted to the mean power of tissue some mm around the masses, by depth and length of the way through masses.

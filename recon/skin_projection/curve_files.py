@@ -18,7 +18,7 @@ def write_json(path: Path, curves: Sequence[SkinCurve]) -> None:
     """Write points of curves in mm of the world, a list for each piece that lies on the skin; whole or not at all."""
     digits = 4  # of mm
     listed = [
-        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, digits).tolist() for piece in pieces(curve.points)]}
+        {"name": curve.name, "kind": curve.kind, "pieces": [np.round(piece, digits).tolist() for piece in _pieces(curve.points)]}
         for curve in curves
     ]
     schema = "sonotwin-curves/1"
@@ -41,7 +41,7 @@ def strips(curves: Sequence[SkinCurve], lines: Lines) -> dict[str, trimesh.Trime
     return {name: strip for name, strip in made.items() if len(strip.faces)}
 
 
-def pieces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _pieces(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Runs of two points and more without a missing one, of a chain : (n, 3)."""
     known = np.isfinite(points).all(axis=1)
     bounds = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))

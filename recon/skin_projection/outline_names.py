@@ -26,7 +26,7 @@ FARTHER = (1.0, 2.5, 4.0)  # gaps from the outline that are tried, as multiples 
 ROUND = np.array([[0, -1], [0, 1], [1, 0], [-1, 0], [1, -1], [-1, -1], [1, 1], [-1, 1]])  # sides, over the outline first
 
 
-class Table(NamedTuple):
+class _Table(NamedTuple):
     """Places about a mass, to the right and down as camera 1 sees them, in mm on the skin."""
 
     chart_from_table: Array  # (3, 3), of (right, down, 1) to places on the chart
@@ -108,7 +108,7 @@ def _known(curve: SkinCurve) -> Array:
     return curve.points[np.isfinite(curve.points).all(axis=1)]
 
 
-def _table(curve: SkinCurve, sight: Sight) -> Table:
+def _table(curve: SkinCurve, sight: Sight) -> _Table:
     """The table about a curve's middle, upright as the world is: x to the right, y down."""
     middle = _known(curve).mean(axis=0)
     start = sight.chart(middle)
@@ -117,4 +117,4 @@ def _table(curve: SkinCurve, sight: Sight) -> Table:
     right = across / np.linalg.norm(across)
     turned = np.array([-right[1], right[0]])
     upright = turned if turned @ down > 0 else -turned
-    return Table(np.column_stack([np.append(right, 0) / step, np.append(upright, 0) / step, np.append(start[:2], 1)]))
+    return _Table(np.column_stack([np.append(right, 0) / step, np.append(upright, 0) / step, np.append(start[:2], 1)]))

@@ -40,7 +40,7 @@ class Markup(BaseModel):
     controlPoints: list[ControlPoint] = Field(min_length=2, max_length=10_000)
 
 
-class Markups(BaseModel):
+class _Markups(BaseModel):
     """A file of 3D Slicer's markups."""
 
     markups: list[Markup] = Field(min_length=1, max_length=100)
@@ -57,7 +57,7 @@ def read(path: Path) -> list[Array]:
     InputError
         If the file is missing, damaged or of something else, or a curve has two points in the same place.
     """
-    content = validated(Markups, json_text.read(path, "a curve of 3D Slicer, .mrk.json"), path)
+    content = validated(_Markups, json_text.read(path, "a curve of 3D Slicer, .mrk.json"), path)
     chains = []
     least_mm = 1e-3  # between two control points; nearer ones are one
     for number, markup in enumerate(content.markups):

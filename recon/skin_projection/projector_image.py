@@ -80,7 +80,7 @@ def draw(
         Pixels that are to stay dark, as of `probe_shadow.shadow`.
     """
     lit = in_sight(curves, skin, projector, dark)
-    light = strips_of_light(curves, lit, projector, lines)
+    light = _strips_of_light(curves, lit, projector, lines)
     if dark is not None:
         light[dark] = 0
     return Drawing(np.uint8(np.rint(255 * light ** (1 / gamma))), lit)
@@ -99,7 +99,7 @@ def in_sight(
     return {curve.name: part for curve, part in zip(curves, parts, strict=False)}
 
 
-def strips_of_light(curves: Sequence[SkinCurve], lit: Lit, device: Camera, lines: Lines) -> NDArray[np.float32]:
+def _strips_of_light(curves: Sequence[SkinCurve], lit: Lit, device: Camera, lines: Lines) -> NDArray[np.float32]:
     """Light of a device's pixels : (h, w) by what is lit of curves, of the projector's full light."""
     light = np.zeros(device.size[::-1], np.float32)
     for curve in curves:
@@ -168,7 +168,7 @@ def expected_view(curves: Sequence[SkinCurve], lit: Lit, skin: trimesh.Trimesh, 
     filled = np.where(view == 0, cv2.dilate(view, np.ones((3, 3), np.uint8)), view)  # between vertices that are farther apart
     seen = in_sight(curves, skin, camera)
     both = {name: points & seen[name] for name, points in lit.items()}
-    drawn = strips_of_light(curves, both, camera, lines)
+    drawn = _strips_of_light(curves, both, camera, lines)
     return np.maximum(filled, np.uint8(np.rint(255 * drawn)))
 
 

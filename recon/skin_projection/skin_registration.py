@@ -65,8 +65,8 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
         If too little of the old skin lies on the new one, or its shape leaves the motion open, as a plane's does.
     """
     before, after = patches(old), patches(new)
-    least_slack = 1e-9  # see `slack`: less is a plane or another shape without any noise, whose equations have no solution
-    if not len(after.middles) or slack(before) < least_slack:
+    least_slack = 1e-9  # see `_slack`: less is a plane or another shape without any noise, whose equations have no solution
+    if not len(after.middles) or _slack(before) < least_slack:
         raise InputError("skin: expected one that is bent in all directions, found one that slides in itself: measure more of it")
     first_mm, last_mm = 15.0, 4.0  # farthest pair, at first and at last
     tree, pose, reach = surface_tree(after.middles), np.eye(4), first_mm
@@ -99,7 +99,7 @@ def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:
     return SkinShift(pose, SHARED_NOISE * variance * np.linalg.inv(squares), float(np.sqrt(variance)), share)
 
 
-def slack(skin: Patches) -> float:
+def _slack(skin: Patches) -> float:
     """How far a skin is from sliding in itself: the least mean square of its ways along its normals, in any motion of size 1."""
     if len(skin.middles) < len(SETTLED):
         return 0.0

@@ -65,7 +65,7 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
     printed = board.Config(**design.model_dump(exclude={"kind", "white", "unusual"}))
     held = HeldBoard(settings.rig, printed, known_to_board(patterns, settings.rig), settings.tracing, settings.seed)
     patience = 3  # times as often as poses are wanted, the hand holds the board: some may be refused
-    return _devices(settings, held, BoardHand(held.hold, patience * count))
+    return _devices(settings, held, _BoardHand(held.hold, patience * count))
 
 
 def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:
@@ -80,7 +80,7 @@ def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: O
     return StillDevices({name: rig.camera(name) for name in settings.cameras}, rig.projector(), operator)
 
 
-class BoardHand:
+class _BoardHand:
     """Holds the board where it is asked to, some times at most, and then ends."""
 
     def __init__(self, hold: Callable[[rigid.Array], None], most: int) -> None:

@@ -27,7 +27,7 @@ def emitted(patterns: Patterns, projector: ProjectorDevice, errors: FrameDraw) -
 
 
 @dataclass(frozen=True)
-class Lit:
+class _Lit:
     """Images : n of (h, w), W/mm^2/sr, each with an even light of its own added."""
 
     images: Stack
@@ -46,4 +46,4 @@ def with_stray(images: Stack, stray_dn: Array, device: CameraDevice, wavelength_
     """Images : n of (h, w), W/mm^2/sr, each with its stray light : (n,) 8-bit DN."""
     electrons = stray_dn * 2 ** (exposure.bits - 8) / number_per_electron(device.sensor, exposure)
     radiance = electrons / (electrons_per_radiance(device, wavelength_nm) * exposure.time_s)
-    return Lit(images, radiance.astype(np.float32)) if radiance.any() else images
+    return _Lit(images, radiance.astype(np.float32)) if radiance.any() else images

@@ -29,7 +29,7 @@ FEWER = 4  # times fewer samples in the outer half of the reach, where almost al
 DU, DV, LENS_X, LENS_Y = range(4)  # columns of the sample points
 
 
-class View(NamedTuple):
+class _View(NamedTuple):
     """A board as a camera's rays meet it."""
 
     board_from_camera: Array  # (4, 4) mm
@@ -38,7 +38,7 @@ class View(NamedTuple):
     reach_px: float  # from a pixel's centre, within which lies all its light
 
 
-class Tables(NamedTuple):
+class _Tables(NamedTuple):
     """Ideal coordinates x/z, y/z at some pixels' centres, and their change for one px in u and one px in v. All (m, 2)."""
 
     centre: Array
@@ -46,7 +46,7 @@ class Tables(NamedTuple):
     down: Array
 
 
-class Samples(NamedTuple):
+class _Samples(NamedTuple):
     """Sample points of the pixels' light."""
 
     footprint: Array  # px from a pixel's centre, by even fractions of its light along one axis
@@ -79,12 +79,12 @@ def compute_edges(image: Images, optics: CameraOptics, board: Print, world_from_
     camera = optics.camera
     board_from_camera = np.ascontiguousarray(rigid.invert(world_from_board) @ rigid.invert(camera.camera_from_world))
     depths = rigid.apply(rigid.invert(board_from_camera), _corners(board))[:, 2]
-    view = View(board_from_camera, optics.aperture_mm / 2, optics.focus_mm, optics.reach_px(np.maximum(depths, 1.0)))
-    tables = Tables(*(np.ascontiguousarray(np.float64(table).T) for table in optics.tables))
+    view = _View(board_from_camera, optics.aperture_mm / 2, optics.focus_mm, optics.reach_px(np.maximum(depths, 1.0)))
+    tables = _Tables(*(np.ascontiguousarray(np.float64(table).T) for table in optics.tables))
     kinds = _kinds(view, board, tables).reshape(image.shape)
     edges = np.flatnonzero(kinds == EDGE)
     turns = np.random.default_rng(seed).random((len(edges), 3)) * [1, 1, 2 * np.pi]
-    chosen = Tables(*(table[edges] for table in tables))
+    chosen = _Tables(*(table[edges] for table in tables))
     shares = _black_shares(view, board, chosen, _footprint(optics), _sample_points(), turns)
     transmission = optics.transmission.ravel()[edges]
     found = _mixed(image / optics.transmission, kinds, edges, shares) * transmission
@@ -112,7 +112,7 @@ def _sample_points() -> Array:
 
 
 @kernel
-def _meet(view: View, board: Print, x, y, lens_x, lens_y):
+def _meet(view: _View, board: Print, x, y, lens_x, lens_y):
     """Where on the board, mm, a ray ends that leaves a point of the lens for ideal coordinates (x, y) in focus."""
     to, focus = view.board_from_camera, view.focus_mm
     ox, oy = lens_x * view.lens_radius, lens_y * view.lens_radius
@@ -154,7 +154,7 @@ def _beyond(board: Print, disc, x, y):
 
 
 @kernel
-def _reach_mm(view: View, board: Print, tables: Tables, k, x, y):
+def _reach_mm(view: _View, board: Print, tables: _Tables, k, x, y):
     """The reach of a pixel's light on the board, from its place there : mm."""
     centre, across, down = tables.centre[k], tables.across[k], tables.down[k]
     ax, ay = _meet(view, board, centre[0] + across[0], centre[1] + across[1], 0.0, 0.0)
@@ -164,7 +164,7 @@ def _reach_mm(view: View, board: Print, tables: Tables, k, x, y):
     return view.reach_px * math.sqrt((squares + math.sqrt(max(squares * squares - 4 * area * area, 0.0))) / 2)
 
 
-def _kinds(view: View, board: Print, tables: Tables) -> NDArray[np.uint8]:
+def _kinds(view: _View, board: Print, tables: _Tables) -> NDArray[np.uint8]:
     """Kinds of pixels : (m,), by the distance of each from the nearest rim and from the board's sides."""
     kinds = np.zeros(len(tables.centre), np.uint8)
     in_threads(_fill_kinds, len(kinds), view, board, tables, kinds)
@@ -172,13 +172,13 @@ def _kinds(view: View, board: Print, tables: Tables) -> NDArray[np.uint8]:
 
 
 @kernel
-def _fill_kinds(first, end, view: View, board: Print, tables: Tables, kinds):
+def _fill_kinds(first, end, view: _View, board: Print, tables: _Tables, kinds):
     for k in range(first, end):
         kinds[k] = _kind(view, board, tables, k)
 
 
 @kernel
-def _kind(view: View, board: Print, tables: Tables, k):
+def _kind(view: _View, board: Print, tables: _Tables, k):
     x, y = _meet(view, board, tables.centre[k, 0], tables.centre[k, 1], 0.0, 0.0)
     aside = max(abs(x - board.middle[0]) - board.half[0], abs(y - board.middle[1]) - board.half[1])
     reach = _reach_mm(view, board, tables, k, x, y)
@@ -192,25 +192,25 @@ def _kind(view: View, board: Print, tables: Tables, k):
     return WHITE if beyond > 0 else BLACK
 
 
-def _black_shares(view: View, board: Print, tables: Tables, footprint: Array, points: Array, turns: Array) -> Array:
+def _black_shares(view: _View, board: Print, tables: _Tables, footprint: Array, points: Array, turns: Array) -> Array:
     """Shares of pixels' light that come from discs : (m,).
 
     Each pixel shifts the sample points : (n, 4) round the unit square by some part, and turns them on the lens by some angle,
     of its own : (m, 3).
     """
-    shares, samples = np.zeros(len(turns)), Samples(footprint, points, turns)
+    shares, samples = np.zeros(len(turns)), _Samples(footprint, points, turns)
     in_threads(_fill_shares, len(turns), view, board, tables, samples, shares)
     return shares
 
 
 @kernel
-def _fill_shares(first, end, view: View, board: Print, tables: Tables, samples: Samples, shares):
+def _fill_shares(first, end, view: _View, board: Print, tables: _Tables, samples: _Samples, shares):
     for k in range(first, end):
         shares[k] = _black_share(view, board, tables, samples, k)
 
 
 @kernel
-def _black_share(view: View, board: Print, tables: Tables, samples: Samples, k):
+def _black_share(view: _View, board: Print, tables: _Tables, samples: _Samples, k):
     footprint, points, turn = samples.footprint, samples.points, samples.turns[k]
     cx, cy = tables.centre[k, 0], tables.centre[k, 1]
     ax, ay, bx, by = tables.across[k, 0], tables.across[k, 1], tables.down[k, 0], tables.down[k, 1]

@@ -87,7 +87,7 @@ def translucent(scene: Scene, world: mi.Scene) -> list[tuple[mi.Shape, float]]:
 
 def _to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dict:
     """A material as a Mitsuba plugin: Lambertian, or a rough dielectric coat on it, which gel may cover."""
-    reflectance = ramp(0) if has_albedo else material.reflectance
+    reflectance = _ramp(0) if has_albedo else material.reflectance
     if material.roughness is None:
         dry = {"type": "diffuse", "reflectance": reflectance}
     else:
@@ -96,8 +96,8 @@ def _to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dic
         return dry
     gel_roughness, gel_ior = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
     same = _body_reflection(dry) / _body_reflection(_coated(reflectance, gel_roughness, gel_ior))
-    under_gel = ramp(0, same) if has_albedo else same * material.reflectance
-    return {"type": "blendbsdf", "weight": ramp(1), "dry": dry, "wet": _coated(under_gel, gel_roughness, gel_ior)}
+    under_gel = _ramp(0, same) if has_albedo else same * material.reflectance
+    return {"type": "blendbsdf", "weight": _ramp(1), "dry": dry, "wet": _coated(under_gel, gel_roughness, gel_ior)}
 
 
 def _body_reflection(bsdf: dict) -> float:
@@ -121,7 +121,7 @@ def _coated(reflectance: dict | float, roughness: float, ior: float) -> dict:
     }
 
 
-def ramp(axis: int, scale: float = 1.0) -> dict:
+def _ramp(axis: int, scale: float = 1.0) -> dict:
     """A texture whose value is its first or second coordinate: vertices carry their reflectance, and how wet they are, in it.
 
     Mitsuba's own mesh attributes can't be used: its rough plastic asks a texture for its mean, which they don't have.

@@ -30,7 +30,7 @@ STATIONS = (  # title, scene, array, face in the world, direction of the array
 )
 
 
-def bscans() -> dict[str, NDArray[np.uint8]]:
+def _bscans() -> dict[str, NDArray[np.uint8]]:
     """B-scans by title: the breast over its three tumours, wires, rods, a plate, the test object."""
     breast = body(build_scene({"kind": "breast"}))
     images = {}
@@ -45,7 +45,7 @@ def bscans() -> dict[str, NDArray[np.uint8]]:
     return images
 
 
-def sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
+def _sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Images of one size, each under its title, in rows of `COLUMNS`."""
     tiles = []
     gap_px, title_px = 6, 22
@@ -61,7 +61,7 @@ def main() -> None:
     """Write the sheet, at half its size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("picture", type=Path)
-    picture = sheet(bscans())
+    picture = _sheet(_bscans())
     small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(parser.parse_args().picture), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

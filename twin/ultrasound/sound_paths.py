@@ -34,7 +34,7 @@ class Paths(NamedTuple):
     shift_mm: Map  # (w, m) of the beam along the array, by refraction
 
 
-class Steps(NamedTuple):
+class _Steps(NamedTuple):
     """Delay and loss of a step down a line, by label."""
 
     delay_mm: Array  # (n + 1,) shown depth
@@ -51,7 +51,7 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     along = lines.pitch_mm * np.arange(lines.count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), along)
     tissues = body.acoustics(transducer.frequency_mhz)
-    steps = Steps(sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
+    steps = _Steps(sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
     solids = body.packed()
     in_threads(_follow, size[0], paths, solids, tissues, steps, poses)
     return paths

@@ -50,7 +50,7 @@ class Rays(NamedTuple):
     crossings: Array  # (CROSSINGS, 3) of borders
 
 
-class Ray(NamedTuple):
+class _Ray(NamedTuple):
     """One of them, down a line: its place on the face, and its start and direction in the world."""
 
     along: float
@@ -180,7 +180,7 @@ def _border_echoes(field, solids, tissues, rays, spans, scanner, beam, paths):
 
 @njit(inline="always")
 def _ray(along, across, pose):
-    return Ray(
+    return _Ray(
         along,
         across,
         pose[0, 2] * across + pose[0, 3],
