@@ -8,6 +8,7 @@ import numba
 import pytest
 
 from recon.threads import in_threads, mapped
+from tests.patience import PATIENCE_S
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 100])
@@ -62,7 +63,7 @@ def test_a_forked_process_has_threads_of_its_own(monkeypatch):
 
 def meet():
     """Run two parts that wait for each other; `BrokenBarrierError` after a while if one thread is to do both."""
-    barrier = threading.Barrier(2, timeout=20)
+    barrier = threading.Barrier(2, timeout=PATIENCE_S)
     in_threads(lambda first, end: barrier.wait(), 2)
 
 
@@ -74,7 +75,7 @@ def test_parts_run_side_by_side(monkeypatch):
 def test_after_a_mistake_nothing_runs_on(monkeypatch):
     """The other threads end their parts first, and begin no further ones."""
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
-    barrier, ended, begun = threading.Barrier(2, timeout=20), [], []
+    barrier, ended, begun = threading.Barrier(2, timeout=PATIENCE_S), [], []
 
     def part(first, end):
         begun.append(first)
@@ -129,6 +130,7 @@ def test_streams_are_taken_side_by_side_and_end_together():
 
 def test_no_more_than_some_items_are_worked_on_at_once(monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: 8)
+    monkeypatch.setattr(numba, "set_num_threads", lambda count: None)  # more than one core has
     working, most, lock = 0, 0, threading.Lock()
 
     def work(_: int) -> None:

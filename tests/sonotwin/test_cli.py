@@ -11,6 +11,7 @@ import pytest
 from recon import user_cache
 from recon.errors import InputError
 from sonotwin import cli, verb_help
+from tests.patience import PATIENCE_S
 
 VERBS = sorted(path.stem.replace("_", "-") for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
 
@@ -182,7 +183,7 @@ def test_interrupt(failing, capsys):
 def test_a_command_that_is_told_to_end_cleans_up(tmp_path, number, status):
     """One line, the status of the signal, and nothing half written; a second signal doesn't disturb the cleaning."""
     program = """
-import os, signal, sys, time
+import os, signal, sys
 from pathlib import Path
 from recon.files import atomic
 from sonotwin import cli, verb_help
@@ -191,7 +192,7 @@ def work(arguments):
     with atomic.new_folder(Path("out"), "mark"):
         try:
             print("ready", flush=True)
-            time.sleep(60)
+            signal.pause()
         finally:
             if sys.argv[1] != "2":
                 os.kill(os.getpid(), signal.SIGTERM)
@@ -204,6 +205,6 @@ sys.exit(cli.main([]))
     running = subprocess.Popen([sys.executable, "-c", program, str(int(number))], cwd=tmp_path, env=env, text=True, **pipes)
     assert running.stdout.readline() == "ready\n"
     running.send_signal(number)
-    said = running.communicate(timeout=30)[1]
+    said = running.communicate(timeout=PATIENCE_S)[1]
     assert running.returncode == status
     assert len(said.splitlines()) == 1 and list(tmp_path.iterdir()) == []

@@ -20,6 +20,7 @@ from sonotwin import choices, study_plan, study_steps
 from sonotwin.cli import main
 from sonotwin.config import folder, load
 from sonotwin.verbs.study import Config
+from tests.patience import PATIENCE_S
 from tests.twin.studies.made_up import done
 from twin.conditions import Conditions
 from twin.studies import beside_paper, error_budget, experiments, factors, rig_search, surface_trial
@@ -338,7 +339,7 @@ def test_a_key_press_that_reaches_dasks_workers_is_told_in_one_line(tmp_path):
             while not list((tmp_path / "out").glob("**/trials/*.json")) and running.poll() is None:
                 sleep(0.2)
             os.killpg(running.pid, signal.SIGINT)
-            _, said = running.communicate(timeout=120)
+            _, said = running.communicate(timeout=PATIENCE_S)
         finally:
             if running.poll() is None:
                 os.killpg(running.pid, signal.SIGKILL)

@@ -24,10 +24,18 @@ def training(seed: int = 0, steps: int = 2):
     return networks, optimizer
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Bytes of a checkpoint of step 2."""
+    path = tmp_path_factory.mktemp("saved") / "checkpoint.pt"
+    checkpoints.write(path, *training(), SAMPLES, 2, 1.5)
+    return path.read_bytes()
+
+
 @pytest.fixture
-def written(tmp_path):
-    """A checkpoint of step 2."""
-    checkpoints.write(tmp_path / "checkpoint.pt", *training(), SAMPLES, 2, 1.5)
+def written(saved, tmp_path):
+    """A checkpoint of step 2, to be changed."""
+    (tmp_path / "checkpoint.pt").write_bytes(saved)
     return tmp_path / "checkpoint.pt"
 
 

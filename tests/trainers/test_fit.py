@@ -12,6 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tests.patience import PATIENCE_S
 from trainers import fit
 from trainers.architectures import Detector, Segmenter
 from trainers.fit import Plan, progress, rate, read_log
@@ -104,7 +105,7 @@ def test_a_key_press_that_reaches_all_processes_leaves_a_checkpoint(data_set, tm
     try:
         assert running.stdout.readline() == "1\n"
         os.killpg(running.pid, signal.SIGINT)
-        _, told = running.communicate(timeout=60)
+        _, told = running.communicate(timeout=PATIENCE_S)
     finally:
         if running.poll() is None:
             os.killpg(running.pid, signal.SIGKILL)

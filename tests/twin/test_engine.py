@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from recon.errors import InputError
+from tests.patience import PATIENCE_S
 from twin.engine import Engine, results
 
 ENGINES = {
@@ -136,7 +137,7 @@ def alive(process: int) -> bool:
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
-def wait_until(true, seconds: float = 600) -> None:
+def wait_until(true, seconds: float = PATIENCE_S) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "waited in vain"

@@ -11,6 +11,7 @@ import pytest
 from recon.acquisition import frame_stream
 from recon.acquisition.frame_stream import FrameStream, Taken
 from recon.devices.interfaces import Frame
+from tests.patience import PATIENCE_S
 
 IMAGE = np.zeros((2, 3), np.uint8)
 
@@ -31,7 +32,7 @@ def ended(stream: FrameStream) -> bool:
     """Whether a stream ends when it is asked to."""
     ending = threading.Thread(target=stream.end, daemon=True)
     ending.start()
-    ending.join(5)
+    ending.join(PATIENCE_S)
     return not ending.is_alive()
 
 
@@ -46,7 +47,7 @@ def test_an_error_of_the_writer_ends_the_reader_and_comes_out(monkeypatch, error
             raise error
 
     stream = FrameStream(frames_for_ever(), write, 5.0, print)
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE_S
     while stream.alive and time.monotonic() < until:
         time.sleep(0.005)
     assert not stream.alive and ended(stream)
@@ -65,7 +66,7 @@ def test_an_unforeseen_error_of_the_reader_comes_out_and_what_came_is_written():
         return taken
 
     stream = FrameStream(fails, lambda taken: written.append(taken.frame.number), 5.0, print)
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE_S
     while stream.alive and time.monotonic() < until:
         time.sleep(0.005)
     assert ended(stream) and written == [0, 1, 2, 3, 4]

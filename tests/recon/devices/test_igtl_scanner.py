@@ -10,9 +10,9 @@ from recon.devices.openigtlink.igtl_image import Image
 from recon.devices.openigtlink.igtl_messages import Message, Raw, Text
 from recon.devices.openigtlink.igtl_server import Server
 from recon.devices.scan_view import ScanView
+from tests.patience import PATIENCE_S
 from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, plus_image, served
 
-WAIT_S = 10.0
 SMALL = Message("Image", Image(np.zeros((4, 5), np.uint8), np.eye(4)))
 
 
@@ -28,7 +28,7 @@ def publish(server: Server, levels: np.ndarray, device: str = "Image", time_ns: 
 
 
 def frame(scanner: Scanner):
-    found = scanner.frame(WAIT_S)
+    found = scanner.frame(PATIENCE_S)
     assert found is not None
     return found
 
@@ -158,5 +158,5 @@ def test_another_size_is_named(server):
     scanner = IgtlScanner("us", port=server.port)
     publish(server, np.zeros((6, 5), np.uint8))
     with pytest.raises(DeviceError, match="images of 5x4 px, as the first one, found 5x6: another preset"):
-        scanner.frame(WAIT_S)
+        scanner.frame(PATIENCE_S)
     scanner.close()

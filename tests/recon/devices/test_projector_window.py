@@ -13,6 +13,7 @@ from recon.capture.surface_part import read_patterns
 from recon.devices.displays import displays
 from recon.devices.interfaces import DeviceError
 from recon.devices.projector_window import ProjectorWindow
+from tests.patience import PATIENCE_S
 from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.x_server import covered, move_windows, set_output, set_ramp, x_server
 from twin.accuracy.virtual_screen import screenshot
@@ -138,7 +139,7 @@ def test_what_was_covered_comes_back(desktop, projector, noise):
     projector.show(noise)
     with covered(f"{desktop}.1"):
         assert not np.array_equal(screenshot(f"{desktop}.1")[..., 0], noise)
-    end = time.monotonic() + 20
+    end = time.monotonic() + PATIENCE_S
     while not np.array_equal(screenshot(f"{desktop}.1")[..., 0], noise):
         assert time.monotonic() < end, "still covered"
         time.sleep(0.05)

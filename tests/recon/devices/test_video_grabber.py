@@ -11,9 +11,9 @@ import pytest
 from recon.devices import video_grabber
 from recon.devices.interfaces import DeviceError
 from recon.devices.video_grabber import VideoGrabber
+from tests.patience import PATIENCE_S
 
 RATE, COUNT, SIZE = 50, 8, (64, 48)
-PATIENCE_S = 20.0  # with a busy machine
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.patience import PATIENCE_S
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 QUIET = ("--headless=new", "--no-sandbox", "--no-first-run", "--window-size=1000,800")
@@ -63,7 +65,7 @@ class Page:
         """Value of a script."""
         return self.call("Runtime.evaluate", expression=script, awaitPromise=True)["result"].get("value")
 
-    def until(self, holds, seconds=90.0):
+    def until(self, holds, seconds=PATIENCE_S):
         """Wait until a function of the page gives neither None nor False, and give its value."""
         end = monotonic() + seconds
         while (value := holds(self)) is None or value is False:

@@ -5,6 +5,7 @@ from time import monotonic, monotonic_ns, sleep
 import numpy as np
 
 from recon.devices.interfaces import DeviceError, Frame
+from tests.patience import PATIENCE_S
 
 
 class Ticking:
@@ -46,7 +47,7 @@ class Kept:
         self.closed = True
 
 
-def until(holds, seconds=10.0):
+def until(holds, seconds=PATIENCE_S):
     """Wait until something holds; fail if it doesn't."""
     end = monotonic() + seconds
     while not holds():

@@ -4,6 +4,7 @@ from threading import Thread
 from time import monotonic, sleep
 
 from recon.navigation.newest import Newest
+from tests.patience import PATIENCE_S
 
 
 def test_a_slow_reader_takes_the_newest_of_all_that_came():
@@ -18,7 +19,7 @@ def test_a_slow_reader_takes_the_newest_of_all_that_came():
 def test_a_reader_waits_for_what_comes_and_no_longer_than_it_said():
     place = Newest()
     Thread(target=lambda: (sleep(0.05), place.put("now"))).start()
-    assert place.take(5.0) == "now"
+    assert place.take(PATIENCE_S) == "now"
     start = monotonic()
     assert place.take(0.05) is None
     assert monotonic() - start >= 0.05
@@ -28,5 +29,5 @@ def test_an_end_wakes_who_waits():
     place = Newest()
     Thread(target=lambda: (sleep(0.05), place.close())).start()
     start = monotonic()
-    assert place.take(60.0) is None
-    assert monotonic() - start < 50.0
+    assert place.take(PATIENCE_S) is None
+    assert monotonic() - start < PATIENCE_S

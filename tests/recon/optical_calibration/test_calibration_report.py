@@ -13,6 +13,7 @@ import pytest
 from recon.model.calibration import Calibration
 from recon.optical_calibration import calibration_report, figures_of_merit, joint_calibration
 from recon.reports import figures
+from tests.patience import PATIENCE_S
 from tests.recon import board_sets
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -162,7 +163,7 @@ def test_the_page_opens_in_a_browser(written, tmp_path):
         "--window-size=1280,900",
     )
     command = [browser, "--headless=new", *quiet, "--virtual-time-budget=10000", "--dump-dom", path.as_uri()]
-    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
     found = re.search('<pre id="answer">(.*?)</pre>', dom, flags=re.DOTALL)
     assert found, "the page's scripts did not come to their end"
     answer = json.loads(html.unescape(found[1]))

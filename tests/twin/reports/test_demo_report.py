@@ -15,6 +15,7 @@ import pytest
 from recon.capture.surface_part import read_surface
 from recon.reports import figures
 from recon.structured_light import decode, triangulate
+from tests.patience import PATIENCE_S
 from tests.twin import drawn_sweep
 from twin.evaluation import error_parts, surface_errors
 from twin.reports import demo_report
@@ -154,7 +155,7 @@ def test_the_report_opens_in_a_browser(written, tmp_path):
     page.write_text(written.replace("<head>", "<head>" + WATCH, 1).replace("</body>", TELL + "</body>"), encoding="utf-8")
     quiet = ("--no-sandbox", "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1280,900")
     command = [browser, "--headless=new", *quiet, *SOFTWARE_WEBGL, "--virtual-time-budget=30000", "--dump-dom", page.as_uri()]
-    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
     found = re.search('<pre id="answer">(.*?)</pre>', dom, flags=re.DOTALL)
     assert found, "the page's scripts did not come to their end"
     answer = json.loads(html.unescape(found[1]))

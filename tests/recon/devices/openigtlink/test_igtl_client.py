@@ -15,9 +15,8 @@ from recon.devices.openigtlink import igtl_client, igtl_header, igtl_messages
 from recon.devices.openigtlink.igtl_client import Client
 from recon.devices.openigtlink.igtl_messages import Message, Raw, Text, Transform
 from recon.devices.openigtlink.igtl_server import Server
+from tests.patience import PATIENCE_S
 from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, plus_frame, plus_image, pose, served
-
-WAIT_S = 600.0  # for what comes at once unless it hangs
 
 
 @contextmanager
@@ -30,7 +29,7 @@ def client(port: int, **fields):
 
 
 def receive(client: Client) -> Message:
-    received = client.receive(WAIT_S)
+    received = client.receive(PATIENCE_S)
     assert received is not None, client.state
     return received.message
 
@@ -84,12 +83,12 @@ def test_a_source_that_comes_back_is_connected_to_again(caplog, monkeypatch):
     port = first.port
     with client(port) as ours:
         first.publish(Message("State", Text("before")))
-        before = ours.receive(WAIT_S)
+        before = ours.receive(PATIENCE_S)
         first.close()
         assert ours.receive(0.3) is None and not ours.connected
         second = Server(port=port)
         second.publish(Message("State", Text("after")))
-        after = ours.receive(WAIT_S)
+        after = ours.receive(PATIENCE_S)
         second.close()
     assert (before.message.content, after.message.content) == (Text("before"), Text("after"))
     assert after.number == before.number + 2  # a gap
@@ -108,7 +107,7 @@ def test_a_source_of_garbage_is_given_up_and_tried_again(caplog, monkeypatch, ga
     """A stream that isn't one has no place to go on from; a new connection begins with a header."""
     monkeypatch.setattr(igtl_client, "AGAIN_S", 0.05)
     with served(garbage) as (port, connections), client(port) as ours:
-        end, states = time.monotonic() + WAIT_S, set[str]()
+        end, states = time.monotonic() + PATIENCE_S, set[str]()
         while (len(connections) < 4 or len(states) < 2) and time.monotonic() < end:
             states.add(ours.state)
             time.sleep(0.01)
@@ -130,10 +129,10 @@ def test_what_nobody_fetches_is_bounded_and_counted(monkeypatch):
     monkeypatch.setattr(igtl_client, "MOST_WAITING", 10)
     words = [igtl_messages.pack(Message("State", Text(str(k)))) for k in range(50)]
     with served(b"".join(words)) as (port, _), client(port) as ours:
-        end = time.monotonic() + WAIT_S
+        end = time.monotonic() + PATIENCE_S
         while ours.lost < 40 and time.monotonic() < end:
             time.sleep(0.01)
-        found = [ours.receive(WAIT_S) for _ in range(10)]
+        found = [ours.receive(PATIENCE_S) for _ in range(10)]
     assert [one.number for one in found] == list(range(40, 50)) and ours.lost == 40
     assert [one.message.content.text for one in found] == [str(k) for k in range(40, 50)]
 
@@ -142,7 +141,7 @@ def test_bytes_that_nobody_fetches_are_bounded(monkeypatch):
     monkeypatch.setattr(igtl_client, "MOST_WAITING_BYTES", 10_000)
     frames = [plus_image(np.full((30, 100), k, np.uint8)) for k in range(8)]
     with served(b"".join(frames)) as (port, _), client(port) as ours:
-        end = time.monotonic() + WAIT_S
+        end = time.monotonic() + PATIENCE_S
         while ours.lost < 5 and time.monotonic() < end:
             time.sleep(0.01)
         assert [int(receive(ours).content.plane[0, 0]) for _ in range(3)] == [5, 6, 7]

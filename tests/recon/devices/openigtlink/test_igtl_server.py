@@ -17,10 +17,9 @@ from recon.devices.openigtlink.igtl_model import Model
 from recon.devices.openigtlink.igtl_server import Server
 from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError
+from tests.patience import PATIENCE_S
 from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.openigtlink.igtl_peers import TIME_NS, pose
-
-WAIT_S = 600.0  # for what comes at once unless it hangs
 
 
 @pytest.fixture
@@ -32,12 +31,12 @@ def server():
 
 def connected(server: Server) -> socket.socket:
     before = server.clients
-    connection = socket.create_connection(("127.0.0.1", server.port), WAIT_S)
+    connection = socket.create_connection(("127.0.0.1", server.port), PATIENCE_S)
     assert until(lambda: server.clients == before + 1)
     return connection
 
 
-def until(holds, seconds: float = WAIT_S) -> bool:
+def until(holds, seconds: float = PATIENCE_S) -> bool:
     end = time.monotonic() + seconds
     while not holds() and time.monotonic() < end:
         time.sleep(0.005)
@@ -66,15 +65,15 @@ def test_pyigtl_receives_the_same(rng, version):
     server.publish(Message("State", Text("tracking"), TIME_NS))
     server.publish(Message("Masses", Points(("m1", "m2"), points), TIME_NS))
     try:
-        transform = client.wait_for_message("ProbeToTracker", WAIT_S)
+        transform = client.wait_for_message("ProbeToTracker", PATIENCE_S)
         np.testing.assert_allclose(transform.matrix, matrix, rtol=1e-6, atol=1e-6)
         assert abs(transform.timestamp - TIME_NS / 1e9) < 1e-6  # a float of seconds since 1970 has 0.2 us
         assert transform.metadata == ({"Sigma": "0.1"} if version == 2 else {})
-        image = client.wait_for_message("Image_Reference", WAIT_S)
+        image = client.wait_for_message("Image_Reference", PATIENCE_S)
         assert np.array_equal(image.image[0], levels) and image.world_coordinate_system == "ras"
         np.testing.assert_allclose(image.ijk_to_world_matrix, place, rtol=1e-5, atol=1e-2)  # (30 px from the middle) * float32
-        assert client.wait_for_message("State", WAIT_S).string == "tracking"
-        found = client.wait_for_message("Masses", WAIT_S)
+        assert client.wait_for_message("State", PATIENCE_S).string == "tracking"
+        found = client.wait_for_message("Masses", PATIENCE_S)
         np.testing.assert_allclose(found.positions, points, rtol=1e-6)
         assert found.names == ["m1", "m2"]
     finally:
@@ -103,7 +102,7 @@ def test_a_client_that_takes_nothing_holds_up_nobody(server, monkeypatch):
 
     It isn't dropped for its sleep, so that who waits for it waits for ever.
     """
-    monkeypatch.setattr(igtl_server, "STALLED_S", 10 * WAIT_S)
+    monkeypatch.setattr(igtl_server, "STALLED_S", 10 * PATIENCE_S)
     sleeping, waking = connected(server), connected(server)
     splitter, seen = Splitter(), []
 
@@ -117,7 +116,7 @@ def test_a_client_that_takes_nothing_holds_up_nobody(server, monkeypatch):
         levels = np.full((1000, 1000), k, np.uint8)
         server.publish(Message("Image", Image(levels, np.eye(4))))
         assert until(lambda k=k: bool(seen) and seen[-1] >= k)
-    reader.join(WAIT_S)
+    reader.join(PATIENCE_S)
     assert seen[-1] == 99 and len(seen) > 50
     late = []
     splitter = Splitter()
@@ -179,7 +178,7 @@ def test_a_client_that_asks_without_end_is_dropped(server, monkeypatch, caplog):
 
 def test_a_stream_of_bad_clients_fills_no_log(server, caplog):
     for _ in range(30):
-        with socket.create_connection(("127.0.0.1", server.port), WAIT_S) as connection, suppress(OSError):
+        with socket.create_connection(("127.0.0.1", server.port), PATIENCE_S) as connection, suppress(OSError):
             connection.sendall(bytes(100))
             connection.recv(1)
     assert until(lambda: server.clients == 0)
@@ -196,7 +195,7 @@ def test_what_clients_publish_is_left_out(server, rng):
 def test_clients_beyond_the_bound_are_refused(server, monkeypatch):
     monkeypatch.setattr(igtl_server, "MOST_CLIENTS", 1)
     first = connected(server)
-    assert socket.create_connection(("127.0.0.1", server.port), WAIT_S).recv(1) == b""
+    assert socket.create_connection(("127.0.0.1", server.port), PATIENCE_S).recv(1) == b""
     first.close()
     assert until(lambda: server.clients == 0)
     connected(server).close()
