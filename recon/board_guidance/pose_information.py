@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.estimation.covariance import inverse
+from recon.estimation.equations import TINY
 from recon.geometry import rigid, usual_lenses
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import MOTION, linearise
 from recon.model.calibration import Calibration, Uncertainty
 from recon.optical_calibration import uncertainty
-from recon.optical_calibration.adjustment import TINY, free_parameters, inverse
+from recon.optical_calibration.adjustment import free_parameters
 from recon.optical_calibration.distortion_selection import MODELS, TRIED
 from recon.optical_calibration.observations import PROJECTOR
 

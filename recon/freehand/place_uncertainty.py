@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import njit
+from recon.estimation.covariance import propagate
 from recon.files.volumes import Volume
 from recon.freehand import sequences
 from recon.freehand.volume_compounding import Clip, Grid, Mask, Sums
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
-from recon.probe_calibration.point_calibration import NAMES
+from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 
 Array = NDArray[np.float64]
 
@@ -71,12 +71,8 @@ def pose_slopes(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
 
 def probe_slopes(world_from_pixel: Array, probe: ProbeCalibration) -> Array:
     """Coefficients : (n, 3, 3, 8) of places by the probe's calibration, in the order of its NAMES."""
-    along = probe.target_from_image[:3, :2]
-    in_target = np.zeros((3, 3, len(NAMES)))
-    in_target[0, :, 5:] = np.eye(3)
-    for axis in (0, 1):
-        in_target[1 + axis, :, axis] = along[:, axis]
-        in_target[1 + axis, :, 2:5] = -rigid.cross(probe.scale[axis] * along[:, axis])
+    in_target = place_slopes(probe.target_from_image, probe.scale, [(0, 0), (1, 0), (0, 1)])
+    in_target[1:] -= in_target[0]
     return _world_from_target(world_from_pixel, probe)[:, None, :3, :3] @ in_target
 
 
@@ -90,7 +86,7 @@ def from_pixel(probe: ProbeCalibration, pixel: tuple[int, int]) -> ProbeCalibrat
         return moved
     jacobian = np.eye(len(NAMES))
     jacobian[5:] = np.tensordot([1, *pixel], probe_slopes(placed[None], probe)[0], axes=1)
-    return replace(moved, uncertainty=Uncertainty(NAMES, jacobian @ probe.uncertainty.ordered(NAMES) @ jacobian.T))
+    return replace(moved, uncertainty=Uncertainty(NAMES, propagate(jacobian, probe.uncertainty.ordered(NAMES))))
 
 
 def rate_slopes(rates: Array) -> Array:

@@ -6,8 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon import arguments
+from recon.estimation.covariance import propagate
+from recon.estimation.parameters import of_block
 from recon.geometry import camera_jacobian
 from recon.geometry.camera import Array, Camera
+from recon.geometry.camera_jacobian import Linearised
 
 DRIFT_PX = 0.05  # usual standard deviation of cameras' principal points since their calibration
 FOCAL_DRIFT = 4.0e-4  # relative change of a focal length for each px of such a drift; assumed: 0.05 px go with a kelvin, by which
@@ -109,22 +112,30 @@ def _extended(known: Uncertainty | None, names: Sequence[str]) -> Uncertainty:
     return Uncertainty(every, np.zeros((len(every), len(every))) if known is None else known.ordered(every))
 
 
+def moved(cameras: Mapping[str, Camera], names: Sequence[str], step: Array) -> dict[str, Camera]:
+    """Devices with their parameters changed by a step : (g,), in the order of names as of `Uncertainty`."""
+    own = {device: of_block(names, device) for device in cameras}
+    return {device: camera_jacobian.moved(cameras[device], short, step[at]) for device, (at, short) in own.items()}
+
+
+def linearise(cameras: Mapping[str, Camera], device: str, points: Array, names: Sequence[str]) -> Linearised:
+    """A device's projection of points : (m, 3) mm, with derivatives by all parameters of names as of `Uncertainty`."""
+    at, short = of_block(names, device)
+    found = camera_jacobian.linearise(cameras[device], points, short)
+    by_parameter = np.zeros((len(points), 2, len(names)))
+    by_parameter[..., at] = found.by_parameter
+    return replace(found, by_parameter=by_parameter)
+
+
 def projection_slopes(cameras: Mapping[str, Camera], points: Sequence[Array], names: Sequence[str]) -> Array:
     """Derivatives : (m, g) px of all devices' projections, x and y of point after point, by the calibration's parameters.
 
     points : of each device, (n, 3) mm in the world.
     """
-    slopes = []
-    for (device, camera), shown in zip(cameras.items(), points, strict=True):
-        known = [k for k, name in enumerate(names) if name.startswith(f"{device}.")]
-        by_parameter = np.zeros((2 * len(shown), len(names)))
-        own = [names[k].partition(".")[2] for k in known]
-        by_parameter[:, known] = np.concatenate(camera_jacobian.linearise(camera, shown, own).by_parameter)
-        slopes.append(by_parameter)
-    return np.concatenate(slopes)
+    slopes = [linearise(cameras, device, shown, names).by_parameter for device, shown in zip(cameras, points, strict=True)]
+    return np.concatenate(slopes).reshape(-1, len(names))
 
 
 def projection_covariance(cameras: Mapping[str, Camera], points: Sequence[Array], uncertainty: Uncertainty) -> Array:
     """Covariance : (m, m) px^2 of all devices' projections, in the order of `projection_slopes`, by the calibration's errors."""
-    slopes = projection_slopes(cameras, points, uncertainty.names)
-    return slopes @ uncertainty.covariance @ slopes.T
+    return propagate(projection_slopes(cameras, points, uncertainty.names), uncertainty.covariance)

@@ -13,6 +13,7 @@ from recon.model.calibration import Uncertainty
 
 Array = NDArray[np.float64]
 
+NAMES = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")  # of the uncertainty, as of `ProbeCalibration`
 SPEEDS = (300.0, 5000.0)  # m/s, of anything that is scanned
 SPEED_UNITS = {1e3: "km/s", 1e-2: "cm/s", 1e-3: "mm/s"}  # m/s of each
 
@@ -61,3 +62,11 @@ class ProbeCalibration:
         pixels = np.asarray(pixels, float)
         plane = np.concatenate([pixels * self.scale, np.zeros_like(pixels[..., :1])], axis=-1)
         return rigid.apply(self.target_from_image, plane)
+
+
+def place_slopes(target_from_image: Array, scale: Array, pixels: ArrayLike) -> Array:
+    """Derivatives : (n, 3, 8) of the places of pixels : (n, 2), in the target's frame, by the parameters NAMES."""
+    u, v = np.moveaxis(np.asarray(pixels, float)[..., None], 1, 0)
+    x, y = target_from_image[:3, 0], target_from_image[:3, 1]
+    arms = u * scale[0] * x + v * scale[1] * y
+    return np.concatenate([(u * x)[..., None], (v * y)[..., None], rigid.slopes(arms)], axis=-1)

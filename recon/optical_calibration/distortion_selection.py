@@ -11,8 +11,8 @@ import numpy as np
 
 from recon.geometry.camera import Camera
 from recon.geometry.lens_domain import is_one_to_one
-from recon.optical_calibration.adjustment import OUTLIER, fitted, free_parameters
-from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
+from recon.optical_calibration.adjustment import OUTLIER, fit, free_parameters
+from recon.optical_calibration.bundle import Array, Estimate, Problem, linear_system
 from recon.optical_calibration.observations import Observations
 
 ModelName = Literal["none", "radial1", "radial2", "decentred", "brown", "rational", "thin_prism", "tilted"]
@@ -88,20 +88,20 @@ def held_out(own: Observations, start: Estimate, offsets: Array) -> dict[ModelNa
         left_out = np.arange(fold, len(own.poses), FOLDS)
         rest = np.setdiff1d(np.arange(len(own.poses)), left_out)
         known, alone = own.of_poses(rest), Problem(own.of_poses(left_out), offsets[left_out], {})
-        fit, place = replace(start, poses=start.poses[rest]), start.poses[left_out]
+        found, place = replace(start, poses=start.poses[rest]), start.poses[left_out]
         for name in TRIED:
             free = free_parameters(own.devices, dict.fromkeys(own.devices, MODELS[name]))
-            fit, noise, _ = fitted(Problem(known, offsets[rest], free), fit)
-            laid, noise, _ = fitted(alone, replace(fit, poses=place), noise, CONVERGED)
+            found, noise, _ = fit(Problem(known, offsets[rest], free), found)
+            laid, noise, _ = fit(alone, replace(found, poses=place), noise, CONVERGED)
             errors[name][left_out], place = _squares(alone, laid, noise), laid.poses
-            if not all(map(is_one_to_one, fit.cameras.values())):
+            if not all(map(is_one_to_one, found.cameras.values())):
                 torn.add(name)
     return {name: error for name, error in errors.items() if name not in torn or name == TRIED[0]}
 
 
 def _squares(problem: Problem, estimate: Estimate, noise: Array) -> Array:
     """Mean squared distance of each pose's points from where a device is expected to see them, outliers left out : (p,) px^2."""
-    system = linearised(problem, estimate, noise, shaped=False)
+    system = linear_system(problem, estimate, noise)
     counting = problem.observations.seen & (system.lengths <= OUTLIER)
     squares = np.where(counting, np.sum(system.plain**2, axis=-1), 0.0).sum(axis=(1, 2))
     number = counting.sum(axis=(1, 2))

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import board_shape, rigid
 from recon.geometry.camera_jacobian import linearise
 from recon.model.boards import AprilGrid, Board, Charuco, Chessboard
-from recon.optical_calibration.adjustment import Adjustment, adjust, fitted
-from recon.optical_calibration.bundle import ROBUST, Array, Estimate, Problem, linearised
+from recon.optical_calibration.adjustment import Adjustment, adjust, fit
+from recon.optical_calibration.bundle import Array, Estimate, Problem, linear_system
 from recon.optical_calibration.initial_estimate import alone
 from recon.optical_calibration.observations import PROJECTOR, Observations
 
@@ -98,7 +98,7 @@ def consistent(
         Of the board as designed, with the offsets : (p, n, d, 2) px.
     """
     start = _Views(observations, offsets, Estimate(adjusted.calibration.cameras, adjusted.poses, adjusted.points))
-    proposed, noise = _alike(observations, adjusted, turn), np.array(list(adjusted.noise.values()))
+    proposed, noise = _alike(observations, adjusted, turn), adjusted.levels
     found = [_settled(start, flips, free, turn, noise) for flips in (np.zeros_like(proposed), proposed)[: 1 + proposed.any()]]
     views, chosen, cost = min(found, key=lambda each: each[2])
     if chosen.any():
@@ -129,9 +129,8 @@ def _settled(
     chosen = np.zeros_like(flips)
     for _ in range(rounds):
         views, chosen = _turned(views, np.flatnonzero(flips), turn), chosen ^ flips
-        fit = adjust(views.observations, views.estimate, free, views.offsets, board_shape.WIDE, released=True)
-        views = views._replace(estimate=fit.estimate)
-        finer = np.array(list(fit.noise.values()))
+        adjusted = adjust(views.observations, views.estimate, free, views.offsets, board_shape.WIDE, released=True)
+        views, finer = views._replace(estimate=adjusted.estimate), adjusted.levels
         costs = _costs(views, finer)
         flips = costs - _costs(_turned(views, range(len(flips)), turn), finer) > CLEAR
         if not flips.any():
@@ -156,9 +155,8 @@ def _about_the_middle(points: Array) -> Array:
 def _costs(views: _Views, noise: Array) -> Array:
     """Huber's loss of each pose : (p,), placed anew on a print and devices that are held."""
     problem = Problem(views.observations, views.offsets, {})
-    placed = fitted(problem, views.estimate, noise, converged=ALMOST).estimate
-    lengths = linearised(problem, placed, noise, shaped=False).lengths
-    return np.where(lengths <= ROBUST, lengths**2, 2 * ROBUST * lengths - ROBUST**2).sum(axis=(1, 2))
+    placed = fit(problem, views.estimate, noise, converged=ALMOST).estimate
+    return linear_system(problem, placed, noise).losses.sum(axis=(1, 2))
 
 
 def _alike(observations: Observations, adjusted: Adjustment, turn: Turn) -> NDArray[np.bool_]:

@@ -26,10 +26,10 @@ from recon.optical_calibration.adjustment import (
     lens_information,
     scale_errors,
 )
-from recon.optical_calibration.bundle import Array, Estimate, Problem
+from recon.optical_calibration.bundle import Array, Estimate, lens_sigmas
 from recon.optical_calibration.distortion_selection import MODELS, TRIED, ModelName, choose
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
-from recon.optical_calibration.pose_consistency import Consistency, added, consistency, widened
+from recon.optical_calibration.pose_consistency import Consistency, added_covariance, consistency, with_covariance
 from recon.optical_calibration.sightings import Sighting, gather, without_scraps
 from recon.optical_calibration.sightings import light as sighted_light
 from recon.structured_light import plausibility
@@ -185,14 +185,14 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted = adjust(observations, bare, free, offsets, tolerances, released)
     offsets = circle_offsets(observations, adjusted.estimate, board)
     if released:
-        tolerances = _tolerances(observations, adjusted, free, offsets, settings.shape)
-    lenses = _lenses(observations, adjusted, free, offsets, tolerances, released)
+        tolerances = _tolerances(adjusted, settings.shape)
+    lenses = _lenses(adjusted)
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
-    agreement = consistency(observations, adjusted, free, offsets, tolerances, released)
+    agreement = consistency(adjusted)
     if not np.isfinite(agreement.covariance).all():
         raise np.linalg.LinAlgError
-    halves = compare_halves(observations, adjusted, free, offsets, tolerances, released, agreement)
-    adjusted = widened(adjusted, agreement.covariance)
+    halves = compare_halves(adjusted, agreement)
+    adjusted = with_covariance(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
     dropped |= contradicting
     return Result(
@@ -212,32 +212,21 @@ def _shaped(
 ) -> tuple[Estimate, Tolerances]:
     """The board's shape, first held by wide tolerances, and the tolerances that it shows."""
     adjusted = adjust(observations, start, free, offsets, board_shape.WIDE, released=True)
-    return adjusted.estimate, _tolerances(observations, adjusted, free, offsets, shape)
+    return adjusted.estimate, _tolerances(adjusted, shape)
 
 
-def _tolerances(
-    observations: Observations, adjusted: Adjustment, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
-) -> Tolerances:
+def _tolerances(adjusted: Adjustment, shape: Shape) -> Tolerances:
     """Tolerances of the board by the evidence of the sightings."""
-    information, pull = board_information(observations, adjusted, free, offsets)
-    return board_shape.estimated(information, pull, observations.points, shape.tolerances)
+    information, pull = board_information(adjusted)
+    return board_shape.estimated(information, pull, adjusted.problem.observations.points, shape.tolerances)
 
 
-def _lenses(
-    observations: Observations,
-    adjusted: Adjustment,
-    free: Mapping[str, Sequence[str]],
-    offsets: Array,
-    tolerances: Tolerances,
-    released: bool,
-) -> Array:
+def _lenses(adjusted: Adjustment) -> Array:
     """Standard deviations : (g,) by which coefficients of distortion are held to zero, by the evidence of the sightings."""
     lenses, held = adjusted.lenses.copy(), np.isfinite(adjusted.lenses)
     if held.any():
-        cameras = adjusted.calibration.cameras
-        most = np.concatenate([usual_lenses.largest(cameras[device], free[device]) for device in observations.devices])
-        shown = lens_information(observations, adjusted, free, offsets, tolerances, released)
-        lenses[held] = usual_lenses.estimated(*shown, lenses[held], most[held])
+        most = lens_sigmas(replace(adjusted.problem, lenses=None, tightness={}), adjusted.calibration.cameras)
+        lenses[held] = usual_lenses.estimated(*lens_information(adjusted), lenses[held], most[held])
     return lenses
 
 
@@ -267,15 +256,7 @@ def reprojection_rms(observations: Observations, adjusted: Adjustment) -> dict[s
     return dict(zip(observations.devices, np.sqrt(means).tolist(), strict=True))
 
 
-def compare_halves(
-    observations: Observations,
-    adjusted: Adjustment,
-    free: Mapping[str, Sequence[str]],
-    offsets: Array,
-    tolerances: Tolerances | None = None,
-    released: bool = False,
-    agreement: Consistency | None = None,
-) -> Array:
+def compare_halves(adjusted: Adjustment, agreement: Consistency | None = None) -> Array:
     """Calibrate every other pose, and the rest, and compare : (g,) differences over their predicted standard deviation.
 
     Standard normal if the predicted covariance is honest. What both halves share, as the board's scale and what lenses usually
@@ -283,26 +264,24 @@ def compare_halves(
 
     agreement : of all poses, whose causes of contradictions count in the halves as well
     """
-    uncertainty = adjusted.calibration.uncertainty
+    problem, uncertainty = adjusted.problem, adjusted.calibration.uncertainty
     assert uncertainty is not None
-    halves = [np.arange(first, len(observations.poses), 2) for first in (0, 1)]
-    if min(observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
+    halves = [np.arange(first, len(adjusted.poses), 2) for first in (0, 1)]
+    if min(problem.observations.seen[half].any(axis=1).sum(axis=0).min() for half in halves) < checks.FEWEST_POSES:
         return np.full(len(uncertainty.names), np.nan)
-    alone = tolerances if released else None  # of a board as designed the tolerances are common to both halves
-    tolerances = tolerances or board_shape.AS_DESIGNED
+    alone = problem.tolerances if problem.released else None  # of a board as designed the tolerances are common to both halves
     fits, variance = [], np.zeros(len(uncertainty.names))
     for half in halves:
         begin = Estimate(adjusted.calibration.cameras, adjusted.poses[half], adjusted.points)
-        seen = observations.of_poses(half)
-        fit = adjust(seen, begin, free, offsets[half], alone, released, adjusted.lenses)
+        seen, offsets = problem.observations.of_poses(half), problem.offsets[half]
+        fit = adjust(seen, begin, problem.free, offsets, alone, problem.released, adjusted.lenses)
         assert fit.calibration.uncertainty is not None
         fits.append(fit.calibration)
         variance += np.diag(fit.calibration.uncertainty.covariance)
-        if released:
-            problem = Problem(seen, offsets[half], free, tolerances, released)
-            variance -= scale_errors(problem, fit.estimate) ** 2
+        if problem.released:
+            variance -= scale_errors(fit.problem, fit.estimate) ** 2
         if agreement is not None:
-            variance += np.diag(added(seen, fit, free, offsets[half], tolerances, released, agreement))
+            variance += np.diag(added_covariance(fit, agreement))
     return deviation(*fits) / np.sqrt(variance)
 
 

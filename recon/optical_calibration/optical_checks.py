@@ -132,7 +132,7 @@ def warnings(observations: Observations, adjustment: Adjustment) -> list[str]:
             found.append(
                 f"{device}: the lens model folds within the image, where pixels have no ray: more points there, or another model"
             )
-        elif device in adjustment.tightness:
+        elif device in adjustment.problem.tightness:
             found.append(f"{device}: the points leave a pole or a fold near the image; the lens is held to weaker distortion")
         elif not is_one_to_one(camera):
             found.append(

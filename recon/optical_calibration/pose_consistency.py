@@ -8,19 +8,19 @@ likeliest sizes of both are found, and their parts added to the covariance.
 Source: Liang and Zeger 1986 (covariance by clusters).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from recon.estimation.covariance import inverse, propagate
 from recon.geometry import rigid
-from recon.geometry.board_shape import Tolerances, bends
+from recon.geometry.board_shape import bends
 from recon.model.calibration import Calibration
 from recon.optical_calibration import uncertainty
-from recon.optical_calibration.adjustment import Adjustment, inverse, prior_information, without_poses
-from recon.optical_calibration.bundle import Array, Estimate, Problem, linearised
-from recon.optical_calibration.observations import Observations
+from recon.optical_calibration.adjustment import Adjustment
+from recon.optical_calibration.bundle import Array, Estimate, Problem, linear_system
 
 BENDS_MM = np.append(0.0, np.geomspace(2e-4, 0.2, 16))  # standard deviations of each bend that are thought of, RMS over the board
 FACTORS = np.geomspace(1.0, 100.0, 13)  # of variances
@@ -65,17 +65,10 @@ class Pulls(NamedTuple):
     bends: Array  # (p, k, 3) by a bend of 1 mm of each kind
 
 
-def consistency(
-    observations: Observations,
-    adjusted: Adjustment,
-    free: Mapping[str, Sequence[str]],
-    offsets: Array,
-    tolerances: Tolerances,
-    released: bool,
-) -> Consistency:
-    """Compare the poses of an adjustment, made with the same arguments."""
+def consistency(adjusted: Adjustment) -> Consistency:
+    """Compare the poses of an adjustment."""
     assert adjusted.calibration.uncertainty is not None
-    parts, whole, carry = _parts(Problem(observations, offsets, free, tolerances, released, adjusted.lenses), adjusted)
+    parts, whole, carry = _parts(adjusted)
     covariances = np.array([carry @ (part - part @ whole @ part) @ carry.T for part, _, _ in parts])
     scale = 1 / np.sqrt(np.maximum(np.diag(covariances.sum(axis=0)), 1e-300))
     values, vectors = np.linalg.eigh(scale[:, None] * covariances.sum(axis=0) * scale)
@@ -84,7 +77,7 @@ def consistency(
     white = root @ carry  # from pulls on all shared unknowns
     pulls = Pulls(
         np.array([white @ right for _, right, _ in parts]),
-        np.array([root @ each @ root.T for each in covariances]),
+        propagate(root, covariances),
         np.array([white @ slopes for _, _, slopes in parts]),
     )
     scatter = float((pulls.found**2).sum() / max(np.count_nonzero(shown), 1))
@@ -97,30 +90,23 @@ def consistency(
     bend, factor = float(BENDS_MM[place[0]]), float(FACTORS[place[1]])
     evidence = float(np.sqrt(2 * (likely.max() - likely[0].max())))  # BENDS_MM begins with none
     wider = covariance + _added(parts, carry, bend, factor)
-    return Consistency(scatter, bend, evidence, float(np.sqrt(factor)), _rise(observations, adjusted, wider), wider)
+    return Consistency(scatter, bend, evidence, float(np.sqrt(factor)), _rise(adjusted, wider), wider)
 
 
-def added(
-    observations: Observations,
-    adjusted: Adjustment,
-    free: Mapping[str, Sequence[str]],
-    offsets: Array,
-    tolerances: Tolerances,
-    released: bool,
-    causes: Consistency,
-) -> Array:
+def added_covariance(adjusted: Adjustment, causes: Consistency) -> Array:
     """Covariance : (g, g) that causes, found in these and other poses, add to that of an adjustment's devices."""
     if not causes.bend_mm and causes.factor == 1:
         return np.zeros_like(causes.covariance)
-    parts, _, carry = _parts(Problem(observations, offsets, free, tolerances, released, adjusted.lenses), adjusted)
+    parts, _, carry = _parts(adjusted)
     return _added(parts, carry, causes.bend_mm, causes.factor**2)
 
 
-def _parts(problem: Problem, adjusted: Adjustment) -> tuple[list[tuple[Array, Array, Array]], Array, Array]:
+def _parts(adjusted: Adjustment) -> tuple[list[tuple[Array, Array, Array]], Array, Array]:
     """What each pose has for all unknowns, as of `_of_pose`; the covariance of these; and its rows of the parameters."""
+    problem = replace(adjusted.problem, lenses=adjusted.lenses, tightness={})
     observations = problem.observations
     parts = [_of_pose(problem, adjusted, p, bends(observations.points)) for p in range(len(observations.poses))]
-    whole = inverse(sum(information for information, _, _ in parts) + prior_information(problem, adjusted.estimate))
+    whole = inverse(sum(information for information, _, _ in parts) + problem.prior(adjusted.estimate))
     return parts, whole, whole[: len(problem.names)]
 
 
@@ -131,23 +117,23 @@ def _added(parts: Sequence[tuple[Array, Array, Array]], carry: Array, bend: floa
     return (found + found.T) / 2
 
 
-def widened(adjusted: Adjustment, covariance: Array) -> Adjustment:
+def with_covariance(adjusted: Adjustment, covariance: Array) -> Adjustment:
     """The same adjustment with another covariance."""
     found = adjusted.calibration
     assert found.uncertainty is not None
     return replace(adjusted, calibration=Calibration(found.cameras, replace(found.uncertainty, covariance=covariance)))
 
 
-def _rise(observations: Observations, adjusted: Adjustment, covariance: Array) -> float:
+def _rise(adjusted: Adjustment, covariance: Array) -> float:
     """Standard deviation of projections by a covariance over that by the adjustment's own, of the device in which it rises most.
 
     Of the board's points where they were seen; of a board with many some are enough.
     """
-    some = slice(None, None, max(len(adjusted.points) // SOME_POINTS, 1))
+    observations, some = adjusted.problem.observations, slice(None, None, max(len(adjusted.points) // SOME_POINTS, 1))
     places = np.array([rigid.apply(pose, adjusted.points[some]) for pose in adjusted.poses])
     seen = observations.seen[:, some]
     volume = places[seen.any(axis=-1)]
-    wider = widened(adjusted, covariance).calibration
+    wider = with_covariance(adjusted, covariance).calibration
     rises = [1.0]
     for d, device in enumerate(observations.devices):
         points = places[seen[..., d]]
@@ -162,14 +148,13 @@ def _rise(observations: Observations, adjusted: Adjustment, covariance: Array) -
 def _of_pose(problem: Problem, adjusted: Adjustment, p: int, ways: Array) -> tuple[Array, Array, Array]:
     """One pose's information on the shared unknowns : (g, g), its pull : (g,), and the pull's slopes : (g, 3) by bends, 1/mm."""
     one = replace(problem, observations=problem.observations.of_poses([p]), offsets=problem.offsets[[p]])
-    noise = np.array(list(adjusted.noise.values()))
 
-    def pulled(points: Array) -> tuple[Array, Array]:
+    def pull(points: Array) -> tuple[Array, Array]:
         estimate = Estimate(adjusted.calibration.cameras, adjusted.poses[[p]], points)
-        return without_poses(linearised(one, estimate, noise, problem.released))
+        return linear_system(one, estimate, adjusted.levels).equations.reduced()
 
-    information, right = pulled(adjusted.points)
-    bent = [pulled(adjusted.points + STEP_MM * way.reshape(-1, 3))[1] for way in ways.T]
+    information, right = pull(adjusted.points)
+    bent = [pull(adjusted.points + STEP_MM * way.reshape(-1, 3))[1] for way in ways.T]
     return information, right, (np.stack(bent, axis=1) - right[:, None]) / STEP_MM
 
 

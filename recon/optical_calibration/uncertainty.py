@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from recon.estimation.covariance import propagate
 from recon.geometry.camera import Array, Camera
-from recon.geometry.camera_jacobian import linearise, moved
-from recon.model.calibration import Calibration, Uncertainty
+from recon.model.calibration import Calibration, Uncertainty, linearise, moved
 
 GRID = (9, 7)  # points of the working volume a depth, across and down
 MAP_STEP_PX = 16  # of maps over an image
@@ -26,12 +26,7 @@ MAP_STEP_PX = 16  # of maps over an image
 
 def apply(calibration: Calibration, change: Array) -> Calibration:
     """Move the parameters of a calibration by change : (g,), in the order and the units of its uncertainty's names."""
-    names, change = _known(calibration).names, np.asarray(change, float)
-    cameras = {}
-    for device, camera in calibration.cameras.items():
-        own = [k for k, name in enumerate(names) if name.startswith(f"{device}.")]
-        cameras[device] = moved(camera, [names[k].removeprefix(f"{device}.") for k in own], change[own])
-    return replace(calibration, cameras=cameras)
+    return replace(calibration, cameras=moved(calibration.cameras, _known(calibration).names, np.asarray(change, float)))
 
 
 def working_volume(calibration: Calibration, depths: Sequence[float]) -> Array:
@@ -194,7 +189,7 @@ def _total(covariances: Array) -> Array:
 
 def _covariances(calibration: Calibration, slopes: Array) -> Array:
     """Covariances : (m, k, k) of values that depend on the parameters by slopes : (m, k, g)."""
-    return slopes @ _known(calibration).covariance @ np.swapaxes(slopes, -1, -2)
+    return propagate(slopes, _known(calibration).covariance)
 
 
 def _point_slopes(
@@ -234,12 +229,8 @@ def rigid_modes(points: Array) -> Array:
 
 def _slopes(calibration: Calibration, device: str, points: Array) -> tuple[Array, Array]:
     """Derivatives of a device's pixels by the points : (m, 2, 3), px/mm, and by all parameters : (m, 2, g)."""
-    names = _known(calibration).names
-    own = [k for k, name in enumerate(names) if name.startswith(f"{device}.")]
-    found = linearise(calibration.cameras[device], points, [names[k].removeprefix(f"{device}.") for k in own])
-    by_parameter = np.zeros((len(points), 2, len(names)))
-    by_parameter[..., own] = found.by_parameter
-    return found.by_point, by_parameter
+    found = linearise(calibration.cameras, device, points, _known(calibration).names)
+    return found.by_point, found.by_parameter
 
 
 def _known(calibration: Calibration) -> Uncertainty:

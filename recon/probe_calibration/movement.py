@@ -2,9 +2,19 @@
 
 A bracket gives under its load or slips, wires are pushed or sag: then the crossing isn't at one place in all frames. Such a
 movement is described by its course, evenly from the first frame to the last or all at once after one of them, and by its
-size: six numbers of the bracket, three of the wires. Squared residuals that fall by more with it than by noise, as F has it, show
-a movement; of two that may be, Schwarz's criterion chooses. It is named here only: parameters and covariance are those of
-`open_movement`, as a movement that isn't shown can't be excluded either. Source of the criterion: Schwarz 1978.
+size: six numbers of the bracket, three of the wires.
+
+`find` names one. Squared residuals that fall by more with it than by noise, as F has it, show a movement; of two that may be,
+Schwarz's criterion chooses.
+
+`average` takes what may have moved into parameters and covariance, as a movement that isn't shown can't be excluded either.
+Nothing moved, the probe did, or the wires did, evenly or all at once after any frame. Half of a movement is normal, with its size
+as standard deviation. Size and noise aren't known: each course and size is weighed by its evidence, which is the likelihood
+integrated over parameters, movement and noise. The outcome is the mean over all of them, and its covariance that of their
+mixture, with the movement itself; so the errors that the residuals leave open are in it. Residuals are left + slopes x +
+moving h, linear in the parameters x and a movement h; with h ~ N(0, noise^2 size^2) all integrals are closed.
+
+Sources: criterion: Schwarz 1978; evidence of a size: MacKay 1992; unknown noise: Gelman 2013; mean over models: Hoeting 1999.
 """
 
 from collections.abc import Iterator
@@ -14,6 +24,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
+
+from recon.estimation.covariance import inverse
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,8 +39,16 @@ USUAL = 4.0  # times the typical length of residuals: what is longer isn't expla
 LOST = 0.6  # of the frames after a sudden movement, or before it, that are outliers without it
 PROBE, WIRES = "probe", "wires"
 
+STILL, GIVES, SLIP = 0.25, 0.5, 0.25  # probability beforehand that nothing moves, the probe does, the wires do; assumed:
+# a bracket that carries a probe by hand gives more often than not, and does harm later
+EVEN = 0.5  # probability beforehand that a movement is even; else it is sudden, after any frame
+LEAST, LARGEST = 0.03, 1.0  # mm and deg along each axis, of half of a movement: less is lost in noise, more is refused
+SIZES = np.geomspace(LEAST, LARGEST, 16)  # all as likely beforehand, so that no magnitude is preferred
+PROPORTIONS = np.diag([*np.radians(np.ones(3)), *np.ones(3)])  # rad and mm of the probe's turn and shift: 1 deg to 1 mm
+NO_NOISE = 1e-12  # sum of squares of residuals that are none
 
-class Equations(NamedTuple):
+
+class FrameEquations(NamedTuple):
     """Whitened equations of the adjustment, at its solution, of n frames in the order in which they were taken."""
 
     slopes: Array  # (n, 3, g) of the residuals by the parameters
@@ -83,7 +103,7 @@ class Movement:
         return 2 * float(np.degrees(np.linalg.norm(self.growth[:-3])))
 
 
-def find(equations: Equations, used: Mask) -> Movement | None:
+def find(equations: FrameEquations, used: Mask) -> Movement | None:
     """The likeliest movement; None where noise may explain the residuals as well.
 
     used : (n,) frames that aren't outliers. Those of a whole end of the session may be right, and after a sudden movement.
@@ -98,14 +118,14 @@ def find(equations: Equations, used: Mask) -> Movement | None:
     return wires if likelier else probe
 
 
-def _likeliest(equations: Equations, what: str, courses: list[Course], used: Mask) -> Movement | None:
+def _likeliest(equations: FrameEquations, what: str, courses: list[Course], used: Mask) -> Movement | None:
     """Of one kind, over all courses; None where noise may be all."""
-    fits = (_fitted(equations, what, course, used, 2 * len(courses)) for course in courses)
+    fits = (_fit(equations, what, course, used, 2 * len(courses)) for course in courses)
     sure = [one for one in fits if one is not None and one.chance < CHANCE]
     return min(sure, key=lambda one: one.log_chance, default=None)
 
 
-def _courses(equations: Equations, used: Mask) -> Iterator[Course]:
+def _courses(equations: FrameEquations, used: Mask) -> Iterator[Course]:
     """Even, and all at once after each frame, with the frames that each is looked for in."""
     n = len(used)
     number, stills = np.arange(n), {}
@@ -126,7 +146,7 @@ def _courses(equations: Equations, used: Mask) -> Iterator[Course]:
             yield course(np.where(after, 1.0, -1.0), frames)
 
 
-def _still(equations: Equations, frames: Mask) -> tuple[Array, Array]:
+def _still(equations: FrameEquations, frames: Mask) -> tuple[Array, Array]:
     """Orthonormal columns : (3 n, r) that span the slopes of n frames, and the residuals : (3 n,) that no parameters explain."""
     left = equations.residuals[frames].ravel()
     columns, sizes, _ = np.linalg.svd(equations.slopes[frames].reshape(len(left), -1), full_matrices=False)
@@ -134,7 +154,7 @@ def _still(equations: Equations, frames: Mask) -> tuple[Array, Array]:
     return spanned, left - spanned @ (spanned.T @ left)
 
 
-def _fitted(equations: Equations, what: str, course: Course, used: Mask, trials: int) -> Movement | None:
+def _fit(equations: FrameEquations, what: str, course: Course, used: Mask, trials: int) -> Movement | None:
     """The movement by least squares, and the chance of as good a fit by noise in any of some trials."""
     which = equations.by_probe if what == PROBE else equations.by_wires
     frames, left = course.frames, course.left
@@ -166,3 +186,107 @@ def _explained(left: Array, doubtful: Mask, frames: Mask) -> bool:
     lengths = np.linalg.norm(left.reshape(-1, 3), axis=1)
     before = doubtful[frames]
     return not before.any() or bool(np.mean(lengths[before] < USUAL * np.median(lengths[~before])) > 1 - LOST / 2)
+
+
+class Rigid(NamedTuple):
+    """Least squares of k residuals of frames without a movement."""
+
+    slopes: Array  # (k, g)
+    left: Array  # (k,) residuals after the step
+    step: Array  # (g,) of the parameters
+    spread: Array  # (g, g) covariance by noise of variance 1
+
+    @property
+    def freedom(self) -> int:
+        """Residuals beyond the unknowns."""
+        return len(self.left) - len(self.step)
+
+
+class Outcomes(NamedTuple):
+    """The parameters, if movements are of one kind and course, for s sizes."""
+
+    evidence: Array  # (s,) logarithm, with the probability beforehand, but for a constant of all
+    steps: Array  # (s, g)
+    covariances: Array  # (s, g, g), with the movement of the probe
+
+
+def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 1.0) -> tuple[Array, Array]:
+    """Parameters and their covariance over all movements.
+
+    Parameters
+    ----------
+    used : (n,)
+        Frames whose least squares the equations' solution is.
+    frames : (n,)
+        Frames to adjust: these, and others that are as right if something moved.
+    noise : float
+        Standard deviation of the equations' residuals, roughly, by which sizes in mm and deg become those in units of it.
+
+    Returns
+    -------
+    step : (g,)
+        Of the parameters, to those of the middle between both ends.
+    covariance : (g, g)
+        Of either end, so with the movement of the probe.
+    """
+    rigid = _rigid(equations, used, frames)
+    probe, wires = (np.zeros((len(rigid.step), size)) for size in (6, 3))
+    probe[equations.by_probe], wires[equations.by_wires] = PROPORTIONS, np.eye(3)
+    still = _outcomes(rigid, rigid.slopes @ probe, probe, np.zeros(1), STILL)
+    moving = [
+        _outcomes(rigid, np.repeat(course, 3)[:, None] * (rigid.slopes @ by), at_ends, SIZES / noise, chance * share)
+        for course, share in _likely_courses(frames)
+        for by, at_ends, chance in ((probe, probe, GIVES), (wires, 0 * wires, SLIP))
+    ]
+    return _mixture([still, *moving])
+
+
+def _likely_courses(frames: Mask) -> Iterator[tuple[Array, float]]:
+    """Courses : (k,) of the k frames from -1 to 1, even or sudden, and the probability of each."""
+    number, n = np.flatnonzero(frames), len(frames)
+    yield np.linspace(-1, 1, n)[frames], EVEN
+    for first in number[1:]:
+        yield np.where(number >= first, 1.0, -1.0), (1 - EVEN) / (len(number) - 1)
+
+
+def _rigid(equations: FrameEquations, used: Mask, frames: Mask) -> Rigid:
+    """Of some frames; those used have no slope left, as the equations are at their solution."""
+    g, added = equations.slopes.shape[2], frames & ~used
+    slopes, left = equations.slopes[frames].reshape(-1, g), equations.residuals[frames].ravel()
+    spread = inverse(slopes.T @ slopes + np.diag(equations.known))
+    step = -spread @ equations.slopes[added].reshape(-1, g).T @ equations.residuals[added].ravel()
+    return Rigid(slopes, left + slopes @ step, step, spread)
+
+
+def _outcomes(rigid: Rigid, moving: Array, at_ends: Array, sizes: Array, chance: float) -> Outcomes:
+    """The outcomes for all sizes of movements of one kind and course.
+
+    moving : (k, m)
+        Slopes of the residuals by the movement's numbers.
+    at_ends : (g, m)
+        Change of the parameters at either end by these numbers.
+    chance : float
+        Probability beforehand of this kind and course.
+    """
+    pull = rigid.spread @ rigid.slopes.T @ moving  # of rigid parameters, by the movement
+    shown, axes = np.linalg.eigh(moving.T @ (moving - rigid.slopes @ pull))
+    shown = np.maximum(shown, 0)  # rounding may make it less
+    along = -axes.T @ moving.T @ rigid.left
+    ratio = sizes[:, None] ** 2 / (1 + sizes[:, None] ** 2 * shown)  # (s, m) of the movement's variance to the noise's
+    rest = np.maximum(rigid.left @ rigid.left - ratio @ along**2, NO_NOISE)
+    noise = (rest / (rigid.freedom - 2))[:, None, None]  # variance of Student's t
+    growth, spread = (ratio * along) @ axes.T, noise * (axes * ratio[:, None]) @ axes.T
+    squared = spread + growth[:, :, None] * growth[:, None]
+    covariances = noise * rigid.spread + pull @ spread @ pull.T + at_ends @ squared @ at_ends.T
+    evidence = -(np.log1p(sizes[:, None] ** 2 * shown).sum(axis=1) + rigid.freedom * np.log(rest)) / 2
+    return Outcomes(evidence + np.log(chance / len(sizes)), rigid.step - growth @ pull.T, covariances)
+
+
+def _mixture(outcomes: list[Outcomes]) -> tuple[Array, Array]:
+    """Mean : (g,) and covariance : (g, g), each outcome weighed by its evidence."""
+    evidence, steps, covariances = (np.concatenate(each) for each in zip(*outcomes, strict=True))
+    weights = np.exp(evidence - evidence.max())
+    weights /= weights.sum()
+    mean = weights @ steps
+    around = steps - mean
+    return mean, np.tensordot(weights, covariances, 1) + (weights * around.T) @ around

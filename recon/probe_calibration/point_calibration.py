@@ -3,7 +3,7 @@
 The crossing's place in the world is the same in all frames (equation 1 of Meza et al. 2021):
 `world_from_target_i @ target_from_image @ [sx u_i, sy v_i, 0, 1] = wire`, the crossing, unknown and at rest. Unknown are the six
 of `target_from_image`, sx, sy and the wire's three. Written with the columns `sx x`, `sy y` and the image's origin it is linear,
-which gives a start in closed form; Levenberg and Marquardt do the rest.
+which gives a start in closed form; damped least squares do the rest. What may have moved meanwhile is the topic of `movement`.
 
 **Which motion is best.** An error of the tracked angle moves the wire by the lever, here 94 mm, so 0.08 degrees are 0.13 mm: far
 more than the errors of position or pixel. Frames are therefore weighted by their covariance, which has this lever in it. Turns
@@ -29,21 +29,24 @@ from scipy import stats
 
 from recon import arguments, registry
 from recon.errors import InputError
+from recon.estimation.covariance import inverse, propagate, whitening
+from recon.estimation.equations import NormalEquations, Step
+from recon.estimation.levenberg_marquardt import descend
+from recon.estimation.parameters import Blocks
 from recon.geometry import rigid
-from recon.geometry.levenberg_marquardt import descend
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
-from recon.probe_calibration import movement, open_movement, point_equation, probe_checks, wires
+from recon.model.probe import NAMES, ProbeCalibration, place_slopes
+from recon.probe_calibration import movement, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
-from recon.probe_calibration.movement import Equations, Movement
+from recon.probe_calibration.movement import FrameEquations, Movement
 
 PHANTOMS, CROSSED_WIRES = "recon.probe_calibration.phantoms", "crossed_wires"  # a module each; the usual one
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
 
-NAMES = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")  # of the uncertainty; the wire's three follow in the normal equations
-PROBE, WIRE, SHIFT = slice(2, 8), slice(8, 11), range(5, 8)  # parameters: the probe's turn and shift, the wire's place, the shift
+UNKNOWNS = Blocks({"scale": 2, "probe": 6, "wire": 3, "apart": 1})  # as NAMES; the crossing's place; the wires' distance
+SHIFT = slice(5, 8)  # of NAMES
 NO_POSE = "the target was not tracked"
 MIN_FRAMES = 6
 DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
@@ -57,6 +60,7 @@ REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width an
 ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
 FLOOR_MM = 1e-3  # no sighting counts as more exact than this
 APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
+KNOWN = np.append(np.zeros(11), APART_MM**-2)  # information on UNKNOWNS beforehand
 
 
 @dataclass(frozen=True)
@@ -115,11 +119,11 @@ class _Estimate:
     wire: Array  # (3,)
     apart: float = 0.0  # mm, of the wires
 
-    def moved(self, step: Array) -> "_Estimate":
-        """After a step : (12,) of sx, sy, the turn, the shift, the wire and the wires' distance."""
-        return _Estimate(
-            rigid.moved(self.target_from_image, step[2:8]), self.scale + step[:2], self.wire + step[8:11], self.apart + step[11]
-        )
+    def moved(self, step: Step) -> "_Estimate":
+        """After a step of UNKNOWNS."""
+        scale, probe, wire, apart = UNKNOWNS.split(step.shared)
+        pose = rigid.moved(self.target_from_image, probe)
+        return _Estimate(pose, self.scale + scale, self.wire + wire, self.apart + float(apart[0]))
 
     def pixels(self, sightings: Sightings) -> Array:
         """Pixels : (n, 2) of the midpoint between the wires."""
@@ -186,21 +190,20 @@ def calibrate(
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
         _say_why(sightings, noise, rms, factor, inliers, _farthest(estimate, sightings, numbers))
     slopes, left = _whitened(estimate, sightings, noise)
-    known = np.append(np.zeros(11), [] if sightings.beside is None else APART_MM**-2)
-    equations = Equations(slopes[..., : len(known)], left, PROBE, WIRE, known)
+    used = UNKNOWNS["wire"].stop if sightings.beside is None else len(UNKNOWNS)
+    equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], KNOWN[:used])
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
-    step, whole = open_movement.adjusted(equations, solved, inliers, factor)
-    estimate = estimate.moved(np.pad(step, (0, 12 - len(known))))
+    step, covariance = movement.average(equations, solved, inliers, factor)
+    estimate = estimate.moved(Step(np.pad(step, (0, len(UNKNOWNS) - used)), np.zeros((0, 0))))
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
+    covariance = covariance[: len(NAMES), : len(NAMES)].copy()
     try:
-        information = np.linalg.inv(whole)
-        used = sightings.of(inliers)
-        probe_checks.information(estimate.target_from_image, estimate.scale, information, used, size, max_sigma_mm)
+        place = estimate.target_from_image, estimate.scale
+        probe_checks.certainty(*place, covariance, sightings.of(inliers), size, max_sigma_mm)
     except InputError as error:
         raise InputError(str(error) if moved is None else f"{error}; {moved.described}") from None
-    covariance = whole[: len(NAMES), : len(NAMES)].copy()
-    covariance[np.ix_(SHIFT, SHIFT)] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
+    covariance[SHIFT, SHIFT] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
     calibration = ProbeCalibration(estimate.target_from_image @ ahead, estimate.scale, uncertainty)
@@ -237,14 +240,45 @@ def from_images(
     return Sightings(poses[good], pixels, pixel_covariance=covariance, directions=lines), found
 
 
+def closed_form(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """Least squares without iteration, all frames alike, for any number of sets of frames at once.
+
+    `R_i (u_i a + v_i b + t) + t_i = wire` is linear in a = sx x, b = sy y, t and the wire. The lengths of a and b are the scales;
+    the rotation is the one nearest to their directions.
+
+    Parameters
+    ----------
+    poses, pixels : (..., n, 4, 4) and (..., n, 2)
+        n >= 4.
+
+    Returns
+    -------
+    target_from_image, scale, wire : (..., 4, 4), (..., 2), (..., 3)
+    """
+    turns, shifts = poses[..., :3, :3], poses[..., :3, 3]
+    u, v = pixels[..., 0, None, None], pixels[..., 1, None, None]
+    fixed = np.broadcast_to(-np.eye(3), turns.shape)
+    design = np.concatenate([u / 100 * turns, v / 100 * turns, turns / 100, fixed / 100], axis=-1)  # columns of like length
+    rows = (*pixels.shape[:-2], -1)
+    solution = -(np.linalg.pinv(design.reshape(*rows, 12)) @ shifts.reshape(*rows, 1))[..., 0] / 100
+    columns = np.stack([solution[..., :3], solution[..., 3:6]], axis=-1)
+    scale = np.linalg.norm(columns, axis=-2)
+    left, _, right = np.linalg.svd(columns / np.maximum(scale, 1e-12)[..., None, :], full_matrices=False)
+    axes = left @ right
+    result = np.zeros((*pixels.shape[:-2], 4, 4))
+    result[..., :3, :2], result[..., :3, 2] = axes, np.cross(axes[..., 0], axes[..., 1])
+    result[..., :3, 3], result[..., 3, 3] = solution[..., 6:9], 1
+    return result, scale, solution[..., 9:]
+
+
 def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
     """Covariance : (k, 3, 3) mm^2, in the target's frame, of the places of pixels : (k, 2); zero if the calibration has none."""
     pixels = np.asarray(pixels, float)
     if calibration.uncertainty is None:
         return np.zeros((len(pixels), 3, 3))
     order = [NAMES.index(name) for name in calibration.uncertainty.names]
-    jacobian = point_equation.point_jacobian(calibration.target_from_image, calibration.scale, pixels)[..., order]
-    return jacobian @ calibration.uncertainty.covariance @ np.swapaxes(jacobian, -1, -2)
+    slopes = place_slopes(calibration.target_from_image, calibration.scale, pixels)[..., order]
+    return propagate(slopes, calibration.uncertainty.covariance)
 
 
 def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float = 180.0) -> tuple[Array, Array]:
@@ -306,7 +340,7 @@ def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Arr
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)
     local[:, 2, 2] += (noise.slice_mm if sightings.slice_mm is None else sightings.slice_mm) ** 2
     world_from_image = sightings.poses[:, :3, :3] @ estimate.target_from_image[:3, :3]
-    return lever @ pose @ np.swapaxes(lever, 1, 2) + world_from_image @ local @ np.swapaxes(world_from_image, 1, 2)
+    return propagate(lever, pose) + propagate(world_from_image, local)
 
 
 def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
@@ -320,46 +354,39 @@ def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
 def _whitened(estimate: _Estimate, sightings: Sightings, noise: Noise) -> tuple[Array, Array]:
     """Slopes : (n, 3, 12) of the residuals and these : (n, 3), in standard deviations."""
     turns = sightings.poses[:, :3, :3]
-    both = np.zeros((len(turns), 3, 13))  # slopes, and the residuals as last column
-    both[..., :8] = turns @ point_equation.point_jacobian(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
-    both[..., WIRE] = -np.eye(3)
+    both = np.zeros((len(turns), 3, len(UNKNOWNS) + 1))  # slopes, and the residuals as last column
+    both[..., : len(NAMES)] = turns @ place_slopes(estimate.target_from_image, estimate.scale, estimate.pixels(sightings))
+    both[..., UNKNOWNS["wire"]] = -np.eye(3)
     if sightings.beside is not None:
         beside = sightings.beside * estimate.scale
-        both[..., 11] = -np.einsum("nij,nj->ni", turns, beside @ estimate.target_from_image[:3, :2].T)
-    both[..., 12] = _residuals(estimate, sightings)
-    both = np.linalg.inv(np.linalg.cholesky(_covariances(estimate, sightings, noise))) @ both
-    return both[..., :12], both[..., 12]
+        both[..., -2] = -np.einsum("nij,nj->ni", turns, beside @ estimate.target_from_image[:3, :2].T)
+    both[..., -1] = _residuals(estimate, sightings)
+    both = whitening(_covariances(estimate, sightings, noise)) @ both
+    return both[..., :-1], both[..., -1]
 
 
-def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[Array, Array, float]:
-    """Matrix (12, 12), right-hand side (12,) and cost, with the covariances as they are at the estimate."""
+def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> tuple[NormalEquations, float]:
+    """Normal equations and cost, with the covariances as they are at the estimate; no frame has unknowns of its own."""
     slopes, residuals = _whitened(estimate, sightings, noise)
-    white = (np.sqrt(weights)[:, None, None] * slopes).reshape(-1, 12)
-    left = (np.sqrt(weights)[:, None] * residuals).ravel()
-    matrix, rhs, cost = white.T @ white, -white.T @ left, float(left @ left)
-    matrix[11, 11] += 1 / APART_MM**2
-    rhs[11] -= estimate.apart / APART_MM**2
-    return matrix, rhs, cost + (estimate.apart / APART_MM) ** 2
+    root = np.sqrt(weights)[:, None]
+    left, departures = -root * residuals, np.zeros(len(UNKNOWNS))
+    departures[UNKNOWNS["apart"]] = estimate.apart
+    equations = NormalEquations.of_rows(root[..., None] * slopes, np.zeros((*left.shape, 0)), left)
+    return equations.held(np.diag(KNOWN), departures), float(np.sum(left**2) + (estimate.apart / APART_MM) ** 2)
 
 
-def _levenberg_marquardt(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array) -> _Estimate:
-    def linearised(estimate: _Estimate) -> tuple[tuple[Array, Array], float]:
-        matrix, rhs, cost = _normal_equations(estimate, sightings, noise, weights)
-        return (matrix, rhs), cost
-
-    def step(_: _Estimate, system: tuple[Array, Array], damping: float) -> Array:
-        matrix, rhs = system
-        return np.linalg.lstsq(matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12)), rhs)[0]
-
-    return descend(start, linearised, step, _Estimate.moved).estimate
+def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | float = 1.0) -> _Estimate:
+    """Weighted least squares."""
+    weights = np.broadcast_to(weights, len(sightings.pixels))
+    return descend(start, lambda estimate: _normal_equations(estimate, sightings, noise, weights), _Estimate.moved).estimate
 
 
 def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) -> _Estimate:
     """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
     n = len(sightings.pixels)
     draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
-    whole = [each[None] for each in point_equation.closed_form(sightings.poses, sightings.pixels)]
-    drawn = point_equation.closed_form(sightings.poses[draws], sightings.pixels[draws])
+    whole = [each[None] for each in closed_form(sightings.poses, sightings.pixels)]
+    drawn = closed_form(sightings.poses[draws], sightings.pixels[draws])
     starts = [np.concatenate(pair) for pair in zip(whole, drawn, strict=True)]
     order = np.argsort(_medians(starts, sightings))[:5]
     best = [_refined_on_half(_Estimate(*(each[k] for each in starts)), sightings, noise) for k in order]
@@ -380,7 +407,7 @@ def _refined_on_half(start: _Estimate, sightings: Sightings, noise: Noise) -> _E
     keep = max(len(sightings.pixels) // 2 + 1, min(9, len(sightings.pixels)))
     for _ in range(2):
         chosen = np.argsort((_residuals(start, sightings) ** 2).sum(axis=1))[:keep]
-        start = _levenberg_marquardt(start, sightings.of(chosen), noise, np.ones(keep))
+        start = _fit(start, sightings.of(chosen), noise)
     return start
 
 
@@ -391,7 +418,7 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         squared = _squared(estimate, sightings, noise)
         scale = max(np.median(squared) / MEDIAN, 1e-12)
         weights = np.maximum(1 - squared / (2 * GATE * scale), 0) ** 2
-        estimate = _levenberg_marquardt(estimate, sightings, noise, weights)
+        estimate = _fit(estimate, sightings, noise, weights)
     inliers = np.zeros(len(sightings.pixels), bool)
     factor, gate = np.sqrt(scale), GATE
     for _ in range(20):
@@ -399,7 +426,7 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         if inside.sum() < MIN_FRAMES or (inside == inliers).all():
             break
         inliers = inside
-        estimate = _levenberg_marquardt(estimate, sightings.of(inliers), noise, np.ones(inliers.sum()))
+        estimate = _fit(estimate, sightings.of(inliers), noise)
         freedom = 3 * inliers.sum() - 11 - (sightings.beside is not None)
         factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
         gate = 3 * stats.f.isf(stats.chi2.sf(GATE, 3), 3, freedom)  # GATE of a level that is itself measured by these frames
@@ -414,9 +441,8 @@ def _squared_as_predicted(estimate: _Estimate, sightings: Sightings, noise: Nois
     slopes, residuals = _whitened(estimate, sightings, noise)
     covariance = np.broadcast_to(np.eye(3), (len(slopes), 3, 3)).copy()
     if used.any():
-        matrix, _, _ = _normal_equations(estimate, sightings.of(used), noise, np.ones(used.sum()))
-        others = slopes[~used]
-        covariance[~used] += others @ np.linalg.pinv(matrix, hermitian=True) @ np.swapaxes(others, 1, 2)
+        equations, _ = _normal_equations(estimate, sightings.of(used), noise, np.ones(used.sum()))
+        covariance[~used] += propagate(slopes[~used], inverse(equations.shared))
     return np.einsum("ni,ni->n", residuals, np.linalg.solve(covariance, residuals[..., None])[..., 0])
 
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from recon import arguments
 from recon.errors import InputError
+from recon.estimation.covariance import root
 from recon.geometry import rigid
-from recon.model.probe import SPEEDS, ProbeCalibration
+from recon.model.probe import SPEEDS, ProbeCalibration, place_slopes
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width, height, px
@@ -104,30 +105,23 @@ def turns(world_from_target: Array) -> tuple[Array, Array]:
     return axes, np.pad(lengths, (0, 3 - len(lengths))) / np.sqrt(len(vectors))
 
 
-def information(
-    target_from_image: Array, scale: Array, matrix: Array, frames: _Frames, size: Size, most_mm: float = MAX_SIGMA_MM
+def certainty(
+    target_from_image: Array, scale: Array, covariance: Array, frames: _Frames, size: Size, most_mm: float = MAX_SIGMA_MM
 ) -> None:
     """Refuse a motion that leaves some pixel's place uncertain by more than some mm, and name its weakest part.
 
     Parameters
     ----------
-    matrix : (12, 12)
-        Normal equations by sx, sy, turn, shift, wire and the wires' distance, with the measured noise.
+    covariance : (8, 8)
+        Of sx, sy, turn and shift.
     most_mm : float
         Standard deviation in any direction.
     """
-    unit = np.sqrt(np.maximum(np.diag(matrix), 1e-12))
-    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
-    root = (vectors / np.sqrt(np.maximum(values, 1e-14))) / unit[:, None]
     right, bottom = size[0] - 1, size[1] - 1
-    worst, open_ = 0.0, np.zeros(3)
-    for u, v in ((0, 0), (right, 0), (0, bottom), (right, bottom)):
-        x, y = target_from_image[:3, 0], target_from_image[:3, 1]
-        arm = u * scale[0] * x + v * scale[1] * y
-        moved = np.column_stack([u * x, v * y, np.cross(np.eye(3), arm).T, np.eye(3)]) @ root[:8]
-        left, lengths, _ = np.linalg.svd(moved)
-        if lengths[0] > worst:
-            worst, open_ = float(lengths[0]), left[:, 0]
+    slopes = place_slopes(target_from_image, scale, [(0, 0), (right, 0), (0, bottom), (right, bottom)])
+    left, lengths, _ = np.linalg.svd(slopes @ root(covariance))
+    corner = int(lengths[:, 0].argmax())
+    worst, open_ = float(lengths[corner, 0]), left[corner, :, 0]
     if worst <= most_mm:
         return
     axes, rms = turns(frames.poses)

@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.estimation.covariance import propagate, root, whitening
+from recon.estimation.equations import eliminate
 from recon.geometry import rigid
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import tracks
-from recon.model.probe import ProbeCalibration
+from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.tracks import Track
-from recon.probe_calibration import latency, point_equation
-from recon.probe_calibration.point_calibration import NAMES
+from recon.probe_calibration import latency
 from recon.rig_check import fault_tests
 from recon.rig_check.fault_tests import Equations, Fault
 
@@ -143,18 +144,18 @@ def equations(lines: Lines, track: Track, known: Known, bottom: Bottom) -> Equat
     placed, n = _placed(lines, track, probe, bottom.lag_s), int(bottom.used.sum())
     points, turns = placed.points[used], placed.poses[used][:, :3, :3]
     by_lag = -(_velocities(lines, track, probe, bottom.lag_s)[used] @ normal)
-    jacobian = point_equation.point_jacobian(probe.target_from_image, probe.scale, lines.pixels[used].reshape(-1, 2))
+    jacobian = place_slopes(probe.target_from_image, probe.scale, lines.pixels[used].reshape(-1, 2))
     by_probe = np.einsum("k,nkl,njlp->njp", normal, turns, jacobian.reshape(n, 2, 3, -1))
     by_plane = np.concatenate([points, -np.ones((n, 2, 1))], axis=2) @ _tangents(normal)
     missing = points @ normal - bottom.offset_mm + by_lag * (known.lag_s - bottom.lag_s)
     noise = _noise(placed, lines, track, known, bottom) + (JITTER_S * by_lag)[..., None] ** 2 * np.eye(2)
-    whiten = np.linalg.inv(np.linalg.cholesky(noise))
+    whiten = whitening(noise)
     rest = whiten @ np.concatenate([-missing[..., None], by_probe, by_lag[..., None]], axis=2)
-    free = fault_tests.eliminated((whiten @ by_plane).reshape(1, 2 * n, 3), rest.reshape(1, 2 * n, -1))[0]
+    free = eliminate((whiten @ by_plane).reshape(1, 2 * n, 3), rest.reshape(1, 2 * n, -1))[0]
     by_probe, by_lag = free[:, 1:-1], free[:, -1:]
     uncertain = [by_lag * known.lag_sigma_s]
     if probe.uncertainty is not None:
-        uncertain.append(by_probe @ fault_tests.root(probe.uncertainty.ordered(NAMES)))
+        uncertain.append(by_probe @ root(probe.uncertainty.ordered(NAMES)))
     faults = {PROBE: Fault(by_probe[:, 2:], USUAL_BEND), CLOCK: Fault(by_lag, USUAL_LAG)}
     whole = Equations(free[:, 0], np.column_stack(uncertain), faults)
     factor = fault_tests.noise_factor(whole)
@@ -172,7 +173,7 @@ def _noise(placed: _Placed, lines: Lines, track: Track, known: Known, bottom: Bo
         shares = tracks.shares_at(track, lines.times[used], bottom.lag_s)
         own = np.einsum("nm,mij->nij", shares**2, track.covariance[track.found])
     by_row = probe.scale[1] * (placed.poses[used][:, :3, :3] @ probe.target_from_image[:3, 1]) @ normal
-    return by_pose @ own @ np.swapaxes(by_pose, 1, 2) + (DEPTH_PX * by_row)[:, None, None] ** 2 * np.eye(2)
+    return propagate(by_pose, own) + (DEPTH_PX * by_row)[:, None, None] ** 2 * np.eye(2)
 
 
 def _misfit(lines: Lines, track: Track, probe: ProbeCalibration, lag_s: float) -> float:

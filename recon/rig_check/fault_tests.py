@@ -60,24 +60,6 @@ class _Test(NamedTuple):
     statistic: float  # squared length of the motion in standard deviations: twice the logarithm of the largest likelihood ratio
 
 
-def eliminated(own: Array, rest: Array) -> Array:
-    """Combinations : (n, k - p, q) of n groups of k equations that are free of their own p unknowns.
-
-    own, rest : (n, k, p) of full rank, and (n, k, q), in standard deviations: the noise of the combinations has variance 1, too.
-    """
-    basis = np.linalg.qr(own, mode="complete")[0][..., own.shape[-1] :]
-    return np.swapaxes(basis, -1, -2) @ rest
-
-
-def root(covariance: Array) -> Array:
-    """A matrix : (g, j) whose product with its transpose is a covariance : (g, g), of any rank and units."""
-    sigma = np.sqrt(np.diag(covariance))
-    unit = np.where(sigma > 0, sigma, 1.0)
-    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
-    kept = variances > 0
-    return unit[:, None] * axes[:, kept] * np.sqrt(variances[kept])
-
-
 def unexplained(equations: Equations, used: NDArray[np.bool_]) -> Array:
     """Residuals : (m,) that no error and no motion explains, whatever their sizes, as fitted to those of a mask : (m,)."""
     explained = _scaled(equations)

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from recon.estimation.covariance import root, whitening
+from recon.estimation.equations import eliminate
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import MOTION, moved
@@ -77,7 +79,7 @@ def parameters(known: Uncertainty, devices: Sequence[str]) -> tuple[str, ...]:
 def of_film(pairs: Sequence[tuple[Sighting, Sighting]], target: Target, names: Sequence[str]) -> Rows:
     """Equations of n pairs of frames that show all circles in both views: of n circles 4 n - 6 each."""
     rows = [_of_pair(pair, target, names) for pair in pairs]
-    free = fault_tests.eliminated(*(np.stack(each) for each in zip(*rows, strict=True)))
+    free = eliminate(*(np.stack(each) for each in zip(*rows, strict=True)))
     by_length = free[..., 1 + len(names) :]
     return Rows(
         free[..., 0].ravel(), free[..., 1 : 1 + len(names)].reshape(-1, len(names)), by_length.reshape(-1, by_length.shape[-1])
@@ -88,7 +90,7 @@ def _of_pair(pair: tuple[Sighting, Sighting], target: Target, names: Sequence[st
     """Slopes by the pose : (4 n, 6), and the rest : (4 n, 1 + g + 2 n - 3), in standard deviations."""
     model, circles = circle_layout.circle_centres(target), circle_layout.circles(target)
     pose = aligned(model, meet([view.camera for view in pair], [view.centres for view in pair])[0])
-    whiten = block_diag(*(np.linalg.inv(np.linalg.cholesky(noise)) for view in pair for noise in view.covariance))
+    whiten = block_diag(*(whitening(noise) for view in pair for noise in view.covariance))
     for _ in range(ROUNDS):
         by_pose, missing = _by_pose(pair, pose, circles)
         pose = rigid.moved(pose, np.linalg.lstsq(whiten @ by_pose, whiten @ missing)[0])
@@ -126,7 +128,7 @@ def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, 
     elsewhere = np.einsum("mki,mi->mk", matches.gradient, matches.seen_at - cameras["cam2"].project(points))
     missing = np.concatenate([np.zeros((m, 2)), matches.first - shown, matches.second - shown - elsewhere], axis=1)
     sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
-    free = fault_tests.eliminated(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
+    free = eliminate(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
     by_optics = free[..., 1:].reshape(-1, len(names))
     return Rows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), len(target.LENGTHS))))
 
@@ -153,8 +155,8 @@ def assembled(film: Rows | None, fringes: Rows | None, target: Target, known: Un
 
 
 def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
-    lengths = fault_tests.root(circle_layout.length_covariance(target))
-    spread = np.column_stack([rows.by_optics @ fault_tests.root(known.ordered(names)), rows.by_length @ lengths])
+    lengths = root(circle_layout.length_covariance(target))
+    spread = np.column_stack([rows.by_optics @ root(known.ordered(names)), rows.by_length @ lengths])
     faults = {}
     for device in (*CAMERAS, PROJECTOR):
         columns = [list(names).index(f"{device}.{name}") for name in MOTION if f"{device}.{name}" in names]

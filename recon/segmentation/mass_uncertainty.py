@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from recon.freehand import place_uncertainty
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
-from recon.probe_calibration.point_calibration import NAMES
+from recon.model.probe import NAMES
 from recon.segmentation.containment import Containment
 from recon.segmentation.mass_surface import Mass
 

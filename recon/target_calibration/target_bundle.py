@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from recon import arguments
-from recon.geometry import camera_jacobian, rigid
+from recon.estimation.covariance import inverse, root, whitening
+from recon.estimation.equations import NormalEquations, Step
+from recon.estimation.levenberg_marquardt import Rules, descend
+from recon.estimation.parameters import Blocks
+from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
-from recon.geometry.levenberg_marquardt import Rules, descend
-from recon.model import circle_layout
+from recon.model import calibration, circle_layout
 from recon.model.calibration import Uncertainty
 from recon.model.rig import Target
 from recon.target_calibration import target_poses
@@ -67,16 +70,10 @@ class _Devices(NamedTuple):
     names: tuple[str, ...]  # of the parameters, (p,)
     axes: Array  # (p, g)
 
-    def changed(self, change: Array) -> tuple[Camera, ...]:
+    def after(self, change: Array) -> tuple[Camera, ...]:
         """Both cameras after a change : (g,)."""
-        if not change.any():
-            return self.cameras
-        step = dict(zip(self.names, self.axes @ change, strict=True))
-        cameras = []
-        for device, camera in enumerate(self.cameras, start=1):
-            own = {name.partition(".")[2]: value for name, value in step.items() if name.startswith(f"cam{device}.")}
-            cameras.append(camera_jacobian.moved(camera, list(own), np.array(list(own.values()))))
-        return tuple(cameras)
+        named = {f"cam{k}": camera for k, camera in enumerate(self.cameras, start=1)}
+        return tuple(calibration.moved(named, self.names, self.axes @ change).values()) if change.any() else self.cameras
 
 
 class _Unknowns(NamedTuple):
@@ -84,15 +81,10 @@ class _Unknowns(NamedTuple):
     optics: Array  # (g,) change of the cameras
     poses: Array  # (n, 4, 4) mm
 
-
-class _System(NamedTuple):
-    """Normal equations: each pose's own, and those of what all pairs share."""
-
-    shared: Array  # (s, s)
-    right: Array  # (s,)
-    own: Array  # (n, 6, 6)
-    own_right: Array  # (n, 6)
-    mixed: Array  # (n, 6, s)
+    @property
+    def blocks(self) -> Blocks:
+        """What all pairs share."""
+        return Blocks({"target": len(self.target), "optics": len(self.optics)})
 
 
 def calibrate(
@@ -144,15 +136,17 @@ def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) ->
     poses = np.stack([pair.world_from_target for pair in pairs])
     unknowns = _Unknowns(start, np.zeros(devices.axes.shape[1]), poses)
     used, noise = np.ones(len(pairs), bool), Noise()
+    whiten = np.stack([whitening(_covariance(pair)) for pair in pairs])
     for _ in range(ROUNDS):
-        unknowns = _fitted(pairs, used, devices, noise, unknowns)
-        levels = _levels(pairs, _residuals(pairs, devices, unknowns))
+        unknowns = _fit(_Problem(pairs, whiten, used, devices, noise), unknowns)
+        levels = _levels(whiten, _residuals(pairs, devices, unknowns))
         typical = np.median(levels[used], axis=0)
         used = (levels < OUTLYING * typical).all(axis=1)
         noise = Noise(max(float(typical[0]), 1.0), float(typical[1]))
-    system, _ = _linearised(_some(pairs, used), devices, noise, unknowns._replace(poses=unknowns.poses[used]))
-    known = len(unknowns.target)
-    covariance = np.linalg.inv(_reduced(system)[0])[:known, :known]
+    own = unknowns._replace(poses=unknowns.poses[used])
+    equations, _ = _normal_equations(_Problem(pairs, whiten, used, devices, noise), own)
+    known = own.blocks["target"]
+    covariance = inverse(equations.reduced()[0])[known, known]
     covariance[DIAMETER, DIAMETER] += (RIM_BIAS * design.outer_diameter_mm) ** 2
     parts = _split(_residuals(pairs, devices, unknowns)[used])
     centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in parts)
@@ -173,30 +167,37 @@ def _devices(cameras: Sequence[Camera], optics: Uncertainty | None) -> _Devices:
     kept = [k for k, name in enumerate(optics.names) if name.startswith(("cam1.", "cam2."))] if optics else []
     if optics is None or not kept:
         return _Devices(tuple(cameras), (), np.zeros((0, 0)))
-    covariance = optics.covariance[np.ix_(kept, kept)]
-    sigma = np.sqrt(np.diag(covariance))
-    unit = np.where(sigma > 0, sigma, 1.0)
-    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
-    some = variances > LEAST_VARIANCE
-    scaled = unit[:, None] * axes[:, some] * np.sqrt(variances[some])
-    return _Devices(tuple(cameras), tuple(optics.names[k] for k in kept), scaled)
+    some = root(optics.covariance[np.ix_(kept, kept)], LEAST_VARIANCE)
+    return _Devices(tuple(cameras), tuple(optics.names[k] for k in kept), some)
 
 
-def _some(pairs: Sequence[Seen], used: NDArray[np.bool_]) -> list[Seen]:
-    return [pair for pair, one in zip(pairs, used, strict=True) if one]
+class _Problem(NamedTuple):
+    """Pairs of which some are used."""
+
+    pairs: Sequence[Seen]  # n
+    whiten: Array  # (n, 10 c, 10 c) 1/px, of c circles, by the noise as predicted
+    used: NDArray[np.bool_]  # (n,)
+    devices: _Devices
+    noise: Noise
+
+    @property
+    def some(self) -> list[Seen]:
+        """Those that are used."""
+        return [pair for pair, one in zip(self.pairs, self.used, strict=True) if one]
 
 
-def _fitted(pairs: Sequence[Seen], used: NDArray[np.bool_], devices: _Devices, noise: Noise, start: _Unknowns) -> _Unknowns:
-    """Least squares over the pairs of `used` : (n,); the poses of the others stay."""
-    linearised = partial(_linearised, _some(pairs, used), devices, noise)
-    found = descend(start._replace(poses=start.poses[used]), linearised, _solved, _moved, rules=RULES).estimate
+def _fit(problem: _Problem, start: _Unknowns) -> _Unknowns:
+    """Least squares over the pairs that are used; the poses of the others stay."""
+    used = problem.used
+    begin = start._replace(poses=start.poses[used])
+    found = descend(begin, partial(_normal_equations, problem), _move, rules=RULES).estimate
     poses = start.poses.copy()
     poses[used] = found.poses
     return found._replace(poses=poses)
 
 
 def predicted(cameras: Sequence[Camera], pose: Array, target: Array) -> Array:
-    """Ellipses of n circles of a target : (p,) of its parameters, as (10 n,) px: all centres, then all shapes, view by view."""
+    """Ellipses of c circles of a target : (p,) of its parameters, as (10 c,) px: all centres, then all shapes, view by view."""
     circles = circle_layout.laid_out(target[:DIAMETER], float(target[DIAMETER]), target[DIAMETER + 1 :])
     seen = [ellipses_of(camera, pose, *circles) for camera in cameras]
     return np.concatenate([centres.ravel() for centres, _ in seen] + [_numbers(shapes) for _, shapes in seen])
@@ -212,33 +213,31 @@ def _numbers(shapes: Array | None) -> Array:
 
 
 def _residuals(pairs: Sequence[Seen], devices: _Devices, unknowns: _Unknowns) -> Array:
-    """Of m pairs of n circles in each view : (m, 10 n) px."""
-    cameras = devices.changed(unknowns.optics)
+    """Of n pairs of c circles in each view : (n, 10 c) px."""
+    cameras = devices.after(unknowns.optics)
     shown = [predicted(cameras, pose, unknowns.target) for pose in unknowns.poses]
     return np.stack([_measured(pair) for pair in pairs]) - shown
 
 
-def _linearised(pairs: Sequence[Seen], devices: _Devices, noise: Noise, unknowns: _Unknowns) -> tuple[_System, float]:
+def _normal_equations(problem: _Problem, unknowns: _Unknowns) -> tuple[NormalEquations, float]:
     """Normal equations at an estimate, and the sum of squares; the cameras' change is measured as zero, once."""
-    known, optics = len(unknowns.target), unknowns.optics
-    steps = np.repeat([LENGTH_STEP, CURVATURE_STEP], [known - 3, 3])
-    shared, right = np.diag(np.repeat([0.0, 1.0], [known, len(optics)])), np.append(np.zeros(known), -optics)
-    changed = [(devices.changed(optics + one), devices.changed(optics - one)) for one in np.eye(len(optics))]
-    cameras, cost = devices.changed(optics), float(optics @ optics)
-    own, own_right, mixed = [], [], []
-    for pair, pose, residual in zip(pairs, unknowns.poses, _residuals(pairs, devices, unknowns), strict=True):
-        by_pose = _slopes(POSE_STEPS, lambda d, pose=pose: predicted(cameras, rigid.moved(pose, d), unknowns.target))
+    devices, optics, blocks = problem.devices, unknowns.optics, unknowns.blocks
+    steps = np.repeat([LENGTH_STEP, CURVATURE_STEP], [len(unknowns.target) - 3, 3])
+    changed = [(devices.after(optics + one), devices.after(optics - one)) for one in np.eye(len(optics))]
+    cameras, by_pose, by_shared = devices.after(optics), [], []
+    for pose in unknowns.poses:
+        by_pose.append(_slopes(POSE_STEPS, lambda d, pose=pose: predicted(cameras, rigid.moved(pose, d), unknowns.target)))
         by_target = _slopes(steps, lambda d, pose=pose: predicted(cameras, pose, unknowns.target + d))
         shown = [[predicted(both, pose, unknowns.target) for both in pair_of] for pair_of in changed]
-        by_shared = np.column_stack([by_target, *((more - less) / 2 for more, less in shown)])
-        information = np.linalg.inv(_covariance(pair, noise))
-        own.append(by_pose.T @ information @ by_pose)
-        own_right.append(by_pose.T @ information @ residual)
-        mixed.append(by_pose.T @ information @ by_shared)
-        shared += by_shared.T @ information @ by_shared
-        right += by_shared.T @ information @ residual
-        cost += float(residual @ information @ residual)
-    return _System(shared, right, np.stack(own), np.stack(own_right), np.stack(mixed)), cost
+        by_shared.append(np.column_stack([by_target, *((more - less) / 2 for more, less in shown)]))
+    residuals = _residuals(problem.some, devices, unknowns)
+    levels = np.repeat(problem.noise, [part.shape[1] for part in _split(residuals)])
+    whiten = problem.whiten[problem.used] / levels[:, None]
+    left = (whiten @ residuals[..., None])[..., 0]
+    equations = NormalEquations.of_rows(whiten @ np.stack(by_shared), whiten @ np.stack(by_pose), left)
+    known = np.repeat([0.0, 1.0], list(blocks.sizes.values()))
+    held = equations.held(np.diag(known), np.append(unknowns.target, optics))
+    return held, float(np.sum(left**2) + optics @ optics)
 
 
 def _slopes(steps: Array, function: Callable[[Array], Array]) -> Array:
@@ -246,51 +245,29 @@ def _slopes(steps: Array, function: Callable[[Array], Array]) -> Array:
     return np.stack([(function(step) - function(-step)) / (2 * step.sum()) for step in np.diag(steps)], axis=1)
 
 
-def _covariance(pair: Seen, noise: Noise) -> Array:
-    """Covariance : (10 n, 10 n) px^2 of a pair's numbers: a shape is about as exact as its centre."""
+def _covariance(pair: Seen) -> Array:
+    """Covariance : (10 c, 10 c) px^2 of a pair's numbers as predicted: a shape is about as exact as its centre."""
     centres = block_diag(*(one for view in pair.views for one in view.covariance))
     shapes = []
     for view in pair.views:
         size = np.trace(np.asarray(view.shapes), axis1=1, axis2=2) / 2
         shapes.append(np.repeat(np.trace(view.covariance, axis1=1, axis2=2) / 2 + (SHAPE_FLOOR * size) ** 2, 3))
-    return block_diag(noise.centres**2 * centres, noise.shapes**2 * np.diag(np.concatenate(shapes)))
+    return block_diag(centres, np.diag(np.concatenate(shapes)))
 
 
-def _levels(pairs: Sequence[Seen], residuals: Array) -> Array:
+def _levels(whiten: Array, residuals: Array) -> Array:
     """RMS : (n, 2) of each pair's centres and shapes over their prediction; of a pose's six numbers each takes off three."""
-    whiten = [np.linalg.inv(np.linalg.cholesky(_covariance(pair, Noise()))) for pair in pairs]
-    normal = np.stack([one @ residual for one, residual in zip(whiten, residuals, strict=True)])
-    centres, shapes = _split(normal)
-    free = centres.shape[1] - POSE, shapes.shape[1]
-    return np.sqrt(np.column_stack([(part**2).sum(axis=1) / count for part, count in zip((centres, shapes), free, strict=True)]))
+    centres, shapes = _split((whiten @ residuals[..., None])[..., 0])
+    squares = (centres**2).sum(axis=1) / (centres.shape[1] - POSE), (shapes**2).sum(axis=1) / shapes.shape[1]
+    return np.sqrt(np.column_stack(squares))
 
 
 def _split(numbers: Array) -> tuple[Array, Array]:
-    """Centres' and shapes' : (m, 4 n) and (m, 6 n) of pairs' numbers : (m, 10 n)."""
+    """Centres' and shapes' : (n, 4 c) and (n, 6 c) of pairs' numbers : (n, 10 c)."""
     centres, shapes = np.split(numbers, [numbers.shape[1] * 2 // 5], axis=1)
     return centres, shapes
 
 
-def _reduced(system: _System) -> tuple[Array, Array]:
-    """Equations : (s, s) and right-hand side : (s,) of what is shared, all poses eliminated."""
-    gain = np.linalg.solve(system.own, np.concatenate([system.mixed, system.own_right[..., None]], axis=2))
-    matrix = system.shared - np.einsum("nis,nit->st", system.mixed, gain[..., :-1])
-    return matrix, system.right - np.einsum("nis,ni->s", system.mixed, gain[..., -1])
-
-
-def _solved(_: _Unknowns, system: _System, damping: float) -> tuple[Array, Array]:
-    """Steps : (s,) of what is shared, and (n, 6) of the poses."""
-    damped = system._replace(
-        shared=system.shared + damping * np.diag(np.diag(system.shared)),
-        own=system.own * (1 + damping * np.eye(POSE)),
-    )
-    matrix, right = _reduced(damped)
-    step = np.linalg.solve(matrix, right)
-    left = damped.own_right - np.einsum("nis,s->ni", damped.mixed, step)
-    return step, np.linalg.solve(damped.own, left[..., None])[..., 0]
-
-
-def _moved(unknowns: _Unknowns, step: tuple[Array, Array]) -> _Unknowns:
-    shared, poses = step
-    target, optics = np.split(shared, [len(unknowns.target)])
-    return _Unknowns(unknowns.target + target, unknowns.optics + optics, rigid.moved(unknowns.poses, poses))
+def _move(unknowns: _Unknowns, step: Step) -> _Unknowns:
+    target, optics = unknowns.blocks.split(step.shared)
+    return _Unknowns(unknowns.target + target, unknowns.optics + optics, rigid.moved(unknowns.poses, step.own))

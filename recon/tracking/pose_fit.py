@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import chdtri
 
+from recon.estimation.covariance import propagate, whitening
+from recon.estimation.equations import Rows, Undetermined
+from recon.estimation.levenberg_marquardt import Rules, descend
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of, slopes_at
-from recon.geometry.levenberg_marquardt import Rules, descend
 from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
 from recon.model.calibration import Uncertainty, projection_covariance
@@ -35,7 +37,6 @@ SUSPICIOUS = 1e-3  # chance of a misfit below which circles that are doubtful ar
 PARAMETERS = 6
 MISFITTING = "views that no pose fits: other circles, or cameras swapped or moved"
 CURVED = 0.05  # standard deviations by which the second order may shift a pose along its least certain direction
-RANK = 1e-7  # least ratio of singular values
 SHAPES = 0.005  # of a disc's size: what blur and gradients leave of a shape, one standard deviation
 CENTRE, WHOLE = 2, 5  # numbers of an ellipse: x and y, and these with a, b and c
 STEPS = np.diag([1e-4] * 3 + [1e-2] * 3)  # rad and mm, by which slopes of shapes are found
@@ -159,23 +160,25 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
     noise = block_diag(*(one for view in views for one in view.noise))
     circles = circle_layout.circles(target)
     cameras = _optics_covariance(start, views, circles, optics)
-    whiten = np.linalg.inv(np.linalg.cholesky(noise + cameras))
+    whiten = whitening(noise + cameras)
     problem = _Problem(views, whiten, circles, circle_layout.deviations(target))
 
-    def linearised(guess: _Guess) -> tuple[tuple[Array, Array], float]:
-        design, residual = _linearised(guess, problem)
-        if not (np.isfinite(design).all() and np.isfinite(residual).all()):
+    def finite_rows(guess: _Guess) -> tuple[Rows, float]:
+        rows = _rows(guess, problem)
+        if not all(np.isfinite(part).all() for part in rows):
             raise _Astray(MISFITTING)
-        return (design, residual), residual @ residual
+        return rows, rows.left @ rows.left
 
     try:
         first = _Guess(start, np.zeros(problem.by_deviation.shape[2]))
-        guess, (design, residual), step, _ = descend(first, linearised, _solved, _moved, _settled, RULES)
+        guess, (design, residual), step, _ = descend(first, finite_rows, _move, _settled, RULES)
+    except Undetermined:
+        return lost("views that do not determine the pose")
     except _Astray as astray:
         return lost(str(astray))
     if step is None:
         return lost(MISFITTING)
-    guess = _moved(guess, step)
+    guess = _move(guess, step)
     misfit, freedom = float(np.sum((residual - design @ step) ** 2)), len(noise) - PARAMETERS
     triangle = _triangulated(guess, problem)
     every = len(noise) == 2 * CENTRE * len(circles.centres)  # circle, by its centre in both views
@@ -188,8 +191,8 @@ def refined(start: Array, views: Sequence[Sighting], target: Target, optics: Unc
         return lost("a target whose front does not face both cameras")
     gain = np.linalg.inv(design.T @ design)[:PARAMETERS] @ design.T
     by_centre, by_deviation = gain[:, : len(noise)] @ whiten, gain[:, len(noise) :]
-    covariance = by_centre @ noise @ by_centre.T
-    shared = by_centre @ cameras @ by_centre.T + by_deviation @ by_deviation.T
+    covariance = propagate(by_centre, noise)
+    shared = propagate(by_centre, cameras) + by_deviation @ by_deviation.T
     merging = False
     if any(view.counted == CENTRE and view.seen.sum() < POINTS for view in views):
         step, bend = _bend(guess, problem)
@@ -215,7 +218,7 @@ def _placed(guess: _Guess, problem: _Problem) -> Circles:
     return problem.circles._replace(centres=problem.circles.centres + problem.by_deviation @ guess.deviations)
 
 
-def _linearised(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
+def _rows(guess: _Guess, problem: _Problem) -> Rows:
     """Slopes : (m + k, 6 + k) and residuals : (m + k,), in standard deviations; ellipses' offsets follow the pose."""
     circles, k = _placed(guess, problem), len(guess.deviations)
     rows, left = [], []
@@ -226,7 +229,7 @@ def _linearised(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
         rows.append(slopes.reshape(-1, PARAMETERS + k))
         left.append((view.measured - _predicted(view, guess, problem)[:, : view.counted]).ravel())
     design = np.vstack([problem.whiten @ np.concatenate(rows), np.eye(k, PARAMETERS + k, PARAMETERS)])
-    return design, np.concatenate([problem.whiten @ np.concatenate(left), -guess.deviations])
+    return Rows(design, np.concatenate([problem.whiten @ np.concatenate(left), -guess.deviations]))
 
 
 def _predicted(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
@@ -266,24 +269,12 @@ def _shape_slopes(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
     return slopes
 
 
-def _solved(_: _Guess, system: tuple[Array, Array], damping: float) -> Array:
-    """The step : (6 + k,) of the equations, with others that keep it short."""
-    design, residual = system
-    if damping > 0:
-        design = np.vstack([design, np.diag(np.sqrt(damping) * np.linalg.norm(design, axis=0))])
-        residual = np.append(residual, np.zeros(design.shape[1]))
-    step, _, rank, _ = np.linalg.lstsq(design, residual, RANK)
-    if rank < design.shape[1]:
-        raise _Astray("views that do not determine the pose")
-    return step
-
-
-def _moved(guess: _Guess, step: Array) -> _Guess:
+def _move(guess: _Guess, step: Array) -> _Guess:
     return _Guess(rigid.moved(guess.world_from_target, step[:PARAMETERS]), guess.deviations + step[PARAMETERS:])
 
 
-def _settled(system: tuple[Array, Array], step: Array) -> bool:
-    return bool(np.sum((system[0] @ step) ** 2) < SETTLED)
+def _settled(rows: Rows, step: Array) -> bool:
+    return bool(np.sum((rows.slopes @ step) ** 2) < SETTLED)
 
 
 def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
@@ -292,10 +283,10 @@ def _bend(guess: _Guess, problem: _Problem) -> tuple[Array, Array]:
     By two circles in one view two tilts fit, and merge where the other view sees the target face on: the shift is large there.
     Source: Bates and Watts 1980 (parameter-effects curvature).
     """
-    design, residual = _linearised(guess, problem)
+    design, residual = _rows(guess, problem)
     left, singular, directions = np.linalg.svd(design, full_matrices=False)
     step = directions[-1] / singular[-1]
-    ahead, behind = (_linearised(_moved(guess, side * step), problem)[1] for side in (1, -1))
+    ahead, behind = (_rows(_move(guess, side * step), problem)[1] for side in (1, -1))
     return step, directions.T @ (left.T @ ((ahead + behind) / 2 - residual) / singular)
 
 

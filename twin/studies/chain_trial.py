@@ -17,6 +17,7 @@ from recon.freehand.place_uncertainty import PlaceErrors
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
+from recon.model import calibration
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, in_use
 from recon.optical_calibration import uncertainty
 from twin.evaluation.surface_errors import rms
@@ -98,9 +99,8 @@ def predicted_points(found: Session, points: Array, column_px: float) -> tuple[A
     assert known is not None
     by_point, by_parameter = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, len(known.names)))
     for device, rows, axes in ((MEASURING[0], slice(0, 2), slice(0, 2)), (MEASURING[1], slice(2, 3), slice(0, 1))):
-        own = [k for k, name in enumerate(known.names) if name.startswith(f"{device}.")]
-        seen = linearise(cameras[device], points, [known.names[k].removeprefix(f"{device}.") for k in own])
-        by_point[:, rows], by_parameter[:, rows, own] = seen.by_point[:, axes], seen.by_parameter[:, axes]
+        seen = calibration.linearise(cameras, device, points, known.names)
+        by_point[:, rows], by_parameter[:, rows] = seen.by_point[:, axes], seen.by_parameter[:, axes]
     to_z = np.linalg.inv(by_point)[:, 2]
     by_optics = np.einsum("mr,mrg->mg", to_z, by_parameter)
     return (to_z[:, 2] * column_px) ** 2, np.einsum("mg,gh,mh->m", by_optics, known.covariance, by_optics)

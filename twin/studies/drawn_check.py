@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon.estimation.covariance import root
 from recon.geometry import camera_jacobian, rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import MOTION
 from recon.geometry.circle_outline import ellipses_of
 from recon.model import circle_layout, tracks
-from recon.model.calibration import Uncertainty
+from recon.model.calibration import Uncertainty, moved
 from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
 from recon.rig_check.bottom_equations import Lines
-from recon.rig_check.fault_tests import root
 from recon.rig_check.fringe_matches import MOST
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
 from recon.tracking.pose import aligned
@@ -51,12 +51,8 @@ class Clocks(NamedTuple):
 
 def drawn_rig(cameras: Devices, known: Uncertainty, rng: np.random.Generator) -> dict[str, Camera]:
     """The true devices of a calibration that errs as its covariance says."""
-    errors = dict(zip(known.names, root(known.covariance) @ rng.standard_normal(len(root(known.covariance).T)), strict=True))
-    true = {}
-    for device, camera in cameras.items():
-        own = {name.partition(".")[2]: value for name, value in errors.items() if name.startswith(f"{device}.")}
-        true[device] = camera_jacobian.moved(camera, list(own), np.array(list(own.values())))
-    return true
+    errors = root(known.covariance)
+    return moved(cameras, known.names, errors @ rng.standard_normal(errors.shape[1]))
 
 
 def turned(devices: Devices, rng: np.random.Generator, device: str, angle_deg: float) -> dict[str, Camera]:

@@ -7,8 +7,8 @@ from recon.board_guidance.pose_information import informations, of_calibration, 
 from recon.errors import InputError
 from recon.model.calibration import Calibration
 from recon.optical_calibration import uncertainty
-from recon.optical_calibration.adjustment import adjust, free_parameters, without_poses
-from recon.optical_calibration.bundle import Estimate, Problem, linearised
+from recon.optical_calibration.adjustment import adjust, free_parameters
+from recon.optical_calibration.bundle import Estimate, Problem, linear_system
 from recon.optical_calibration.distortion_selection import MODELS
 from tests.recon.board_guidance.held_boards import posed, spread
 from tests.recon.board_sets import BOARD, DEVICES, NOISE, devices, observe
@@ -22,10 +22,8 @@ def test_the_sum_of_informations_is_the_bundle_adjustment_s(rig, rng):
     """Slow and plain: the normal equations of the adjustment itself, its poses eliminated."""
     cameras, poses, free = devices(rig), spread(rig, 4, rng), free_parameters(DEVICES, BROWN)
     exact = observe(cameras, poses, rng, noise=dict.fromkeys(DEVICES, 0.0))
-    system = linearised(
-        Problem(exact, np.zeros_like(exact.pixels), free), Estimate(cameras, poses, BOARD.points()), np.ones(3), False
-    )
-    expected = without_poses(system)[0]
+    problem = Problem(exact, np.zeros_like(exact.pixels), free)
+    expected, _ = linear_system(problem, Estimate(cameras, poses, BOARD.points()), np.ones(3)).equations.reduced()
     found = informations(cameras, free, NOISE, poses, BOARD.points()).sum(axis=0)
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)  # of FLOOR_PX

@@ -8,9 +8,8 @@ from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.volume_compounding import Grid
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
+from recon.model.probe import NAMES, ProbeCalibration
 from recon.probe_calibration import point_calibration, sound_in_water
-from recon.probe_calibration.point_calibration import NAMES
 
 SHAPE = (408, 321)
 PIXELS = np.array([[0.0, 0.0], [160.0, 200.0], [320.0, 407.0]])

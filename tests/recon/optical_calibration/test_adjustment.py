@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.estimation.equations import Step
+from recon.estimation.levenberg_marquardt import Unreachable
 from recon.geometry import rigid
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import MATRIX
 from recon.geometry.lens_domain import is_one_to_one
-from recon.geometry.levenberg_marquardt import Unreachable
 from recon.geometry.usual_lenses import largest
 from recon.model.calibration import Calibration
 from recon.optical_calibration import adjustment, optical_checks
 from recon.optical_calibration.adjustment import adjust, free_parameters
-from recon.optical_calibration.bundle import Estimate, Problem, linearised, stepped
+from recon.optical_calibration.bundle import Estimate, Problem, linear_system, move
 from recon.optical_calibration.distortion_selection import MODELS
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
@@ -118,9 +119,9 @@ def test_misjudged_noise_neither_moves_the_end_nor_takes_long(rig, rng, monkeypa
 
     def counted(*arguments, **options):
         evaluations.append(arguments)
-        return linearised(*arguments, **options)
+        return linear_system(*arguments, **options)
 
-    monkeypatch.setattr(adjustment, "linearised", counted)
+    monkeypatch.setattr(adjustment, "linear_system", counted)
     found = adjust(seen, ideal, free)
     assert found.noise["cam1"] > 5 and len(evaluations) < 40
     known = adjust(replace(seen, covariance=seen.covariance * found.noise["cam1"] ** 2), found.estimate, free)
@@ -139,9 +140,9 @@ def test_a_step_to_a_camera_that_can_not_be_is_unreachable(rig, rng):
     for change in (-2 * cameras["projector"].matrix[1, 1], np.nan, -np.inf):
         step[fy] = change
         with pytest.raises(Unreachable):
-            stepped(problem, start, step, still)
+            move(problem, start, Step(step, still))
     step[fy] = 10.0
-    assert stepped(problem, start, step, still).cameras["projector"].matrix[1, 1] == cameras["projector"].matrix[1, 1] + 10
+    assert move(problem, start, Step(step, still)).cameras["projector"].matrix[1, 1] == cameras["projector"].matrix[1, 1] + 10
 
 
 def test_too_few_sightings_are_refused(rig, rng):

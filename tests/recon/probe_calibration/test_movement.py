@@ -6,12 +6,17 @@ import pytest
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.probe_calibration import movement, point_calibration
+from recon.probe_calibration.movement import FrameEquations
 from recon.probe_calibration.point_calibration import Noise, Sightings
 from tests.recon import probe_motions
 
 NOISE = Noise(probe_motions.ANGLE_DEG, probe_motions.POSITION_MM, probe_motions.PIXEL_PX, probe_motions.SLICE_MM)
 DRAWS = 16  # means of squared errors over the 8 expected have a standard deviation of 0.125
 STILL = np.zeros(6), np.zeros(3)
+FRAMES, UNKNOWNS, BY_PROBE, BY_WIRES = 12, 11, slice(2, 8), slice(8, 11)
+WEIGHTS = np.array([300.0, 300.0, 500.0, 500.0, 500.0, *np.full(6, 5.0)])  # of slopes: a pixel, a rad and a mm over 0.2 mm
+SESSIONS = 300
+ALL = np.ones(FRAMES, bool)
 
 
 def calibrations(rig, seeds, grows, after=None):
@@ -131,3 +136,55 @@ def test_the_wires_radius_is_uncertain_along_the_depth(rig, rng):
     added = open_.calibration.uncertainty.covariance - exact.calibration.uncertainty.covariance
     depth = np.concatenate([np.zeros(5), open_.calibration.target_from_image[:3, 1]])
     np.testing.assert_allclose(added, 0.05**2 * np.outer(depth, depth), atol=1e-9)
+
+
+def at_solution(slopes, left):
+    """Equations at the least squares of residuals left : (n, 3), and the step that led there."""
+    flat = slopes.reshape(-1, UNKNOWNS)
+    step = -np.linalg.lstsq(flat, left.ravel())[0]
+    return FrameEquations(slopes, left + slopes @ step, BY_PROBE, BY_WIRES, np.zeros(UNKNOWNS)), step
+
+
+def drawn(rng, noise):
+    """Residuals of the true parameters of the middle, their slopes, and half the movement of the parameters to the end."""
+    slopes = WEIGHTS * rng.standard_normal((FRAMES, 3, UNKNOWNS))
+    kind = rng.choice(3, p=[movement.STILL, movement.GIVES, movement.SLIP])
+    step = np.zeros(UNKNOWNS)
+    if kind == 1:
+        step[BY_PROBE] = noise * rng.choice(movement.SIZES) * movement.PROPORTIONS @ rng.standard_normal(6)
+    if kind == 2:
+        step[BY_WIRES] = noise * rng.choice(movement.SIZES) * rng.standard_normal(3)
+    after = np.arange(FRAMES) >= rng.integers(1, FRAMES)
+    course = np.linspace(-1, 1, FRAMES) if rng.random() < movement.EVEN else np.where(after, 1.0, -1.0)
+    return slopes, noise * rng.standard_normal((FRAMES, 3)) - course[:, None] * (slopes @ step), step
+
+
+@pytest.mark.parametrize("noise", [0.5, 2.0])
+def test_squared_errors_at_both_ends_are_those_predicted(rng, noise):
+    """Of the probe and of the scales, over movements drawn as assumed: 8 by definition, known to 0.2 by so many draws."""
+    squared, rigid = [], []
+    for _ in range(SESSIONS):
+        slopes, left, growth = drawn(rng, noise)
+        equations, back = at_solution(slopes, left)
+        step, covariance = movement.average(equations, ALL, ALL)
+        flat, rest = slopes.reshape(-1, UNKNOWNS), np.sum(equations.residuals**2)
+        still = np.linalg.inv(flat.T @ flat)[:8, :8] * rest / (3 * FRAMES - UNKNOWNS)
+        for end in (-growth, growth):
+            error = (end - back - step)[:8]
+            squared.append(error @ np.linalg.solve(covariance[:8, :8], error))
+            rigid.append((end - back)[:8] @ np.linalg.solve(still, (end - back)[:8]))
+    assert np.mean(squared) == pytest.approx(8, abs=5 * np.std(squared) / np.sqrt(2 * SESSIONS))
+    assert 6.5 < np.mean(squared) < 9.5 and np.mean(rigid) > 20
+
+
+def test_frames_that_turn_out_to_be_right_count_as_if_they_had_been_used(rng):
+    """The last four of twelve, outliers to a rigid bracket: added later or adjusted with the others, the outcome is the same."""
+    slopes, left, _ = drawn(rng, 1.0)
+    used = np.arange(FRAMES) < 8
+    back = -np.linalg.lstsq(slopes[used].reshape(-1, UNKNOWNS), left[used].ravel())[0]
+    known = np.zeros(UNKNOWNS)
+    step, covariance = movement.average(FrameEquations(slopes, left + slopes @ back, BY_PROBE, BY_WIRES, known), used, ALL)
+    together, back_together = at_solution(slopes, left)
+    expected, same = movement.average(together, ALL, ALL)
+    np.testing.assert_allclose(back + step, back_together + expected, atol=1e-9)
+    np.testing.assert_allclose(covariance, same, rtol=1e-6, atol=1e-12)

@@ -11,7 +11,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Pose
-from recon.probe_calibration import point_calibration, point_equation, probe_checks, repeatability, sound_in_water
+from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
 from recon.probe_calibration.point_calibration import Noise, Sightings, calibrate
 from tests.recon import bscans
 from tests.recon.probe_motions import (
@@ -56,7 +56,7 @@ def test_without_noise_the_calibration_is_the_truth(probe, frames):
 
 def test_the_closed_form_is_exact_for_four_frames(probe, frames):
     poses = poses_of(probe, *frames)[:4]
-    pose, scale, _ = point_equation.closed_form(poses, frames[1][:4])
+    pose, scale, _ = point_calibration.closed_form(poses, frames[1][:4])
     assert errors(ProbeCalibration(pose, scale), probe).max() < 1e-5
 
 

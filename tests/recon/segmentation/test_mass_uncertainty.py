@@ -12,8 +12,7 @@ from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
-from recon.probe_calibration.point_calibration import NAMES
+from recon.model.probe import NAMES, ProbeCalibration
 from recon.segmentation import mass_uncertainty
 from recon.segmentation.containment import contain, read_skin
 from recon.segmentation.mass_surface import Mass

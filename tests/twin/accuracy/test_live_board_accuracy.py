@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from recon.estimation.covariance import root
 from recon.model.calibration import Calibration, with_drift
 from recon.optical_calibration import uncertainty
-from recon.rig_check.fault_tests import root
 from twin.accuracy.live_board_accuracy import apart
 from twin.optics.surface_session import calibration_of
 

@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
-from recon.model.probe import ProbeCalibration
+from recon.model.probe import NAMES, ProbeCalibration
 from recon.probe_calibration import repeatability
-from recon.probe_calibration.point_calibration import NAMES
 from twin.studies import tank_trial
 
 SCALE = np.array([0.1229, 0.1184])

@@ -18,7 +18,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
-from recon.probe_calibration import point_equation
+from recon.probe_calibration import point_calibration
 
 Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -72,7 +72,7 @@ def calibrate(matrices: Array, pixels: Array) -> Solved:
 
 def least_squares_of(matrices: Array, pixels: Array) -> tuple[ProbeCalibration, Array]:
     """Least squares over eleven parameters, all frames alike, and the residuals : (n, 3) mm."""
-    start, scale, wire = point_equation.closed_form(matrices, pixels)
+    start, scale, wire = point_calibration.closed_form(matrices, pixels)
 
     def residuals(step: Array) -> Array:
         local = np.column_stack([pixels * (scale + step[:2]), np.zeros(len(pixels))])

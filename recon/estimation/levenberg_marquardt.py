@@ -1,15 +1,15 @@
-"""Least squares by damped Gauss-Newton steps, for problems whose equations are built, and solved, in a way of their own.
+"""Least squares by damped Gauss-Newton steps, for problems whose equations are built in a way of their own.
 
 Source: Levenberg 1944; Marquardt 1963 for the damping by tens. SciPy's `least_squares` serves where a plain Jacobian is enough.
 """
 
 from collections.abc import Callable
 from math import inf
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 Estimate = TypeVar("Estimate")
-System = TypeVar("System")
 Step = TypeVar("Step")
+SomeStep = TypeVar("SomeStep", covariant=True)
 
 LEAST_DAMPING, LAST_DAMPING = 1e-4, 1e8  # after the first step uphill, and where there is no way down
 
@@ -30,6 +30,17 @@ class Unreachable(ValueError):
     """A step that can not be solved for, or that leads to an estimate that can not be: a shorter one may."""
 
 
+class Equations(Protocol[SomeStep]):
+    """A problem linearised at an estimate, as of `recon.estimation.equations`."""
+
+    def step(self, damping: float) -> SomeStep:
+        """Solve with the diagonal times `1 + damping`; may raise `Unreachable`."""
+        ...
+
+
+System = TypeVar("System", bound=Equations)
+
+
 class Descent(NamedTuple, Generic[Estimate, System, Step]):
     """The outcome."""
 
@@ -41,9 +52,8 @@ class Descent(NamedTuple, Generic[Estimate, System, Step]):
 
 def descend(
     start: Estimate,
-    linearised: Callable[[Estimate], tuple[System, float]],
-    solved: Callable[[Estimate, System, float], Step],
-    moved: Callable[[Estimate, Step], Estimate],
+    linearise: Callable[[Estimate], tuple[System, float]],
+    move: Callable[[Estimate, Step], Estimate],
     settled: Callable[[System, Step], bool] = lambda system, step: False,
     rules: Rules = USUAL,
 ) -> Descent[Estimate, System, Step]:
@@ -51,29 +61,27 @@ def descend(
 
     Parameters
     ----------
-    linearised : estimate -> (system, cost)
-        The equations, in any form that `solved` takes, and the sum of squares.
-    solved : estimate, system, damping -> step
-        Solve the equations with their diagonal times `1 + damping`.
-    moved : estimate, step -> estimate
-        Take a step. `Unreachable`, raised by `solved` or `moved`, counts as a step uphill.
+    linearise : estimate -> (system, cost)
+        The equations, and the sum of squares.
+    move : estimate, step -> estimate
+        Take a step. `Unreachable`, raised by this or by the equations, counts as a step uphill.
     settled : system, step -> bool
         Whether a step is so short that nothing is gained by taking it.
     """
     estimate, damping, converged = start, rules.damping, False
-    system, cost = linearised(estimate)
+    system, cost = linearise(estimate)
     for _ in range(rules.steps):
         if converged or damping > LAST_DAMPING:
             break
         try:
-            step = solved(estimate, system, damping)
+            step = system.step(damping)
             if settled(system, step):
                 return Descent(estimate, system, step, True)
-            trial = moved(estimate, step)
+            trial = move(estimate, step)
         except Unreachable:
             damping = max(10 * damping, LEAST_DAMPING)
             continue
-        following, new = linearised(trial)
+        following, new = linearise(trial)
         converged = abs(cost - new) < rules.converged * cost
         if new < cost + rules.rounding:
             estimate, system, cost, damping = trial, following, new, damping / 10

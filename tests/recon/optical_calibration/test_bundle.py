@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.optical_calibration.normal_equations import Sightings, added_up
+from recon.optical_calibration.bundle import Sightings, add_up
 
 POSES, POINTS, ROBUST = 3, 5, 3.0
 OWN = (2, 4, 3)  # parameters of each device
@@ -59,7 +59,7 @@ def all_rows(sightings, gradient):
 def test_the_sums_are_the_products_of_all_rows(sightings, rng, shaped):
     gradient = rng.standard_normal((POSES, POINTS, 2, 2))
     rows, values, expected = all_rows(sightings, gradient)
-    found, lengths = added_up(sightings, gradient, shaped, ROBUST)
+    found, lengths = add_up(sightings, gradient, shaped, ROBUST)
     np.testing.assert_allclose(lengths, expected, rtol=1e-12)
     assert (lengths > ROBUST).any() and (lengths[1, 2, 1], lengths[2, 3, 0], lengths[2, 3, 2]) == (0, 0, 0)
     points, end = sum(OWN), sum(OWN) + 3 * POINTS
@@ -69,8 +69,8 @@ def test_the_sums_are_the_products_of_all_rows(sightings, rng, shaped):
     for p in range(POSES):
         pose = rows[:, end + 6 * p : end + 6 * p + 6]
         np.testing.assert_allclose(found.cross[p], shared.T @ pose, atol=1e-12)
-        np.testing.assert_allclose(found.corner[p], pose.T @ pose, atol=1e-12)
-        np.testing.assert_allclose(found.pose_right[p], pose.T @ values, atol=1e-12)
+        np.testing.assert_allclose(found.own[p], pose.T @ pose, atol=1e-12)
+        np.testing.assert_allclose(found.own_right[p], pose.T @ values, atol=1e-12)
 
 
 def test_an_exact_sighting_still_counts(sightings, rng):
@@ -78,7 +78,7 @@ def test_an_exact_sighting_still_counts(sightings, rng):
     gradient = rng.standard_normal((POSES, POINTS, 2, 2))
     kept = sightings.residuals.copy()
     kept[np.isfinite(kept)] = 0
-    found, lengths = added_up(sightings._replace(residuals=kept), gradient, True, 1e9)
-    usual, _ = added_up(sightings, gradient, True, 1e9)
+    found, lengths = add_up(sightings._replace(residuals=kept), gradient, True, 1e9)
+    usual, _ = add_up(sightings, gradient, True, 1e9)
     assert not lengths.any() and not found.right.any()
     np.testing.assert_allclose(found.shared, usual.shared, atol=1e-12)
