@@ -15,8 +15,9 @@ from sonotwin import study_plan, study_steps
 from sonotwin.choices import read_rig
 from sonotwin.config import load
 from sonotwin.verbs.study import Config
-from twin.accuracy.table_rows import Measurement, Row, Setup
-from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
+from twin.experiments import experiment_runs
+from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.studies import beside_paper, error_budget, factors, rig_search
 from twin.studies.study_runs import TABLE, Done, finite
 
 RIG = "meza2021"
@@ -110,7 +111,7 @@ def exploration(kept: Path, name: str) -> list[Row]:
     fields = ["poses=demo"] if name == "board_poses" else []
     config, done = study(kept, name, f"seeds={SEEDS}", *fields)
     rows = []
-    of = experiments.experiment(config.of)
+    of = experiment_runs.experiment(config.of)
     for figure, limit in of.limits.items():
         if limit:
             ratios = finite(one.figures.get(figure, np.nan) / one.figures.get(limit, np.nan) for one in done)
