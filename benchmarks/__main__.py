@@ -4,7 +4,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from twin.accuracy import table_rows
+from twin.experiments import table_rows
 
 GROUPS = ("optics", "surface", "calibration", "ultrasound", "tracking", "studies", "live", "demo")
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "benchmarks.md"

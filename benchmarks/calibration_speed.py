@@ -11,9 +11,9 @@ from recon.model.rig import Rig
 from recon.optical_calibration.joint_calibration import calibrate
 from recon.threads import mapped
 from sonotwin.config import compose, folder
-from twin.accuracy import calibration_accuracy
-from twin.accuracy.board_sets import BoardSet, rendered
-from twin.accuracy.table_rows import Measurement, Row, Setup
+from twin.experiments import calibration_accuracy
+from twin.experiments.board_sets import BoardSet, rendered
+from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.sensor import Numbers
 
 

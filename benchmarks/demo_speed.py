@@ -10,7 +10,7 @@ from time import perf_counter
 from recon.files import metrics
 from recon.files.metrics import Metrics
 from sonotwin.demonstration import RESULT
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.table_rows import Measurement, Row
 
 
 def measurements() -> list[Measurement]:

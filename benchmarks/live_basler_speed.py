@@ -23,8 +23,8 @@ from recon.capture.manifest import CAMERAS, STAMPS, Device, image_name
 from recon.devices.basler import BaslerSettings, open_camera
 from recon.devices.camera_pairs import CameraPair, Pair
 from recon.devices.interfaces import Image
-from twin.accuracy.table_rows import Measurement, Row
 from twin.devices.virtual_session import OneTake
+from twin.experiments.table_rows import Measurement, Row
 
 PAIRS = 1000
 SIZE = (1280, 1024)

@@ -16,7 +16,7 @@ from recon.devices.openigtlink.igtl_client import Client
 from recon.devices.openigtlink.igtl_image import Image
 from recon.devices.openigtlink.igtl_messages import Message, Transform
 from recon.devices.openigtlink.igtl_server import LOOPBACK, Server
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.table_rows import Measurement, Row
 
 DRAWS = 50  # transforms and images each way
 WAIT_S = 10.0

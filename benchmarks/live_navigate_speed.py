@@ -18,7 +18,7 @@ from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.slicer_publisher import SlicerPublisher
 from sonotwin.config import load
 from sonotwin.verbs import navigate, sweep
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.table_rows import Measurement, Row
 
 LAG_S, RATE_HZ = 0.05, 25  # of the sweep as it is rendered; of cameras and scanner
 FIRST_S, COUNTED_S = 12.0, 12.0  # of which the first are left out: the images are read, and latencies go ten seconds back

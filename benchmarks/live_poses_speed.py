@@ -2,9 +2,9 @@
 
 from recon.model.rig import Rig
 from sonotwin.config import compose
-from twin.accuracy.live_poses_accuracy import GUIDED, Session, guided
-from twin.accuracy.table_rows import Measurement, Row
 from twin.conditions import BoardPrint
+from twin.experiments.live_poses_accuracy import GUIDED, Session, guided
+from twin.experiments.table_rows import Measurement, Row
 
 WAIT_S = 0.5
 

@@ -5,8 +5,8 @@ from recon.model.rig import Rig
 from recon.skin_projection import mass_outline, projector_image
 from sonotwin.config import compose
 from sonotwin.verbs.accuracy import setup_of
-from twin.accuracy import live_skin_accuracy as light
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments import live_skin_accuracy as light
+from twin.experiments.table_rows import Measurement, Row
 
 REPEATS = 15
 MOST_MS = 1000

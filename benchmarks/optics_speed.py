@@ -9,7 +9,7 @@ from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Unifor
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from sonotwin.config import compose
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.table_rows import Measurement, Row
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_pattern

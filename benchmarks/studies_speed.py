@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import psutil
 
-from twin.accuracy.table_rows import Measurement, Row
 from twin.engine import Engine, results
+from twin.experiments.table_rows import Measurement, Row
 
 WORKERS = 2
 LONG_S, LONG = 10.0, 12  # tasks of ten seconds

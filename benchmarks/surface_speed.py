@@ -16,8 +16,8 @@ from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import PointMap, Triangulator
 from scenes.catalogue import build_scene
 from sonotwin.config import compose, folder
-from twin.accuracy.surface_accuracy import TRACING
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.surface_accuracy import TRACING
+from twin.experiments.table_rows import Measurement, Row
 from twin.optics.surface_session import Shooting, calibration_of, shoot
 
 REPEATS = 15

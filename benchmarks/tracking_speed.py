@@ -20,8 +20,8 @@ from recon.tracking.tracker import Tracker
 from scenes.catalogue import build_scene
 from sonotwin.config import folder, load
 from sonotwin.verbs import sweep
-from twin.accuracy.table_rows import Measurement, Row, Setup
-from twin.accuracy.tracking_frames import study
+from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.tracking_frames import study
 from twin.shooting import Quality
 from twin.tracking import film_session, scene_frames
 from twin.tracking.mesh_bank import build_bank

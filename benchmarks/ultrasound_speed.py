@@ -16,8 +16,8 @@ import yaml
 
 from scenes.catalogue import build_scene
 from sonotwin.config import folder
-from twin.accuracy.bmode_accuracy import peer
-from twin.accuracy.table_rows import Measurement, Row
+from twin.experiments.bmode_accuracy import peer
+from twin.experiments.table_rows import Measurement, Row
 from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan, scans
 from twin.ultrasound.echo_solids import body

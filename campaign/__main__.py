@@ -11,7 +11,7 @@ from pathlib import Path
 
 from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, mistakes, soak, sources, two_writers
 from recon.files import atomic
-from twin.accuracy import table_rows
+from twin.experiments import table_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT, DOCUMENT = ROOT / "outputs" / "campaign", ROOT / "docs" / "trust.md"

@@ -12,8 +12,8 @@ from docutils import nodes
 from docutils.parsers.rst import Directive
 
 from sonotwin.verbs import accuracy
-from twin.accuracy import kept_rows
-from twin.accuracy.kept_rows import Kept
+from twin.experiments import kept_rows
+from twin.experiments.kept_rows import Kept
 
 ROOT = Path(__file__).resolve().parent.parent
 HEADS = ("group", "id", "what", "measured", "bar", "limit", "unit", "met", "measured on", "commit")

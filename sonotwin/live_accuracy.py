@@ -1,6 +1,7 @@
 """The live rig's rows: devices, recordings, guided board poses, light on the skin, and the check of the rig."""
 
-from twin.accuracy import (
+from twin.experiments import (
+    check_rates,
     live_basler_accuracy,
     live_board_accuracy,
     live_poses_accuracy,
@@ -8,8 +9,7 @@ from twin.accuracy import (
     live_record_accuracy,
     live_skin_accuracy,
 )
-from twin.accuracy.table_rows import Measurement, Setup
-from twin.studies import check_rates
+from twin.experiments.table_rows import Measurement, Setup
 
 PARTS = (
     live_basler_accuracy,

@@ -24,8 +24,8 @@ from sonotwin import choices, config, rendered_session
 from sonotwin.choices import read_rig
 from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings
 from sonotwin.verbs import reconstruct
-from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.evaluation import session_errors
+from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.ultrasound.timed_sweep import Clocks
 
 Array = NDArray[np.float64]

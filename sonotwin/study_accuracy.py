@@ -15,10 +15,11 @@ from recon.errors import InputError
 from sonotwin import choices, study_plan, study_steps
 from sonotwin.choices import read_rig
 from sonotwin.verbs.study import Config, of_conf
-from twin.accuracy.table_rows import Measurement, Row, Setup
 from twin.engine import Engine
+from twin.experiments import experiment_runs
+from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.optics.surface_session import Shooting
-from twin.studies import beside_paper, error_budget, experiments, factors, rig_search
+from twin.studies import beside_paper, error_budget, factors, rig_search
 from twin.studies.study_runs import TABLE, Done, finite
 
 RIG = "meza2021"
@@ -110,7 +111,7 @@ def exploration(kept: Path, name: str) -> list[Row]:
     """Row d: figures of an exploration over what they are held against, the median over its trials and the largest."""
     config, done = study(kept, name, seeds=SEEDS, **({"poses": choices.read("poses", POSES)} if name == "board_poses" else {}))
     rows = []
-    of = experiments.experiment(config.of)
+    of = experiment_runs.experiment(config.of)
     for figure, limit in of.limits.items():
         if limit:
             ratios = finite(one.figures.get(figure, np.nan) / one.figures.get(limit, np.nan) for one in done)

@@ -10,10 +10,11 @@ from recon.errors import InputError, one_line, validated
 from recon.files import yaml_text
 from recon.model.rig import Part
 from sonotwin import choices
-from twin.studies import experiments, factors, study_runs
+from twin.experiments import experiment_runs
+from twin.experiments.experiment_runs import Settings
+from twin.studies import factors, study_runs
 from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
-from twin.studies.experiments import Settings
 from twin.studies.factors import Point
 from twin.studies.rig_search import Goal
 from twin.studies.study_runs import Trial
@@ -65,7 +66,7 @@ def trials(of: str, settings: Settings, points: Iterable[Point], seeds: Iterable
         If a field isn't one of the experiment's, or a value is nonsense.
     """
     points, base = list(points), settings.model_dump(mode="json")
-    experiments.check_reads(of, {name for point in points for names in point for name in names.split(factors.JOINT)})
+    experiment_runs.check_reads(of, {name for point in points for names in point for name in names.split(factors.JOINT)})
     return study_runs.plan(of, [(point, changed(base, point)) for point in points], list(seeds))
 
 

@@ -11,18 +11,8 @@ from recon.files.metrics import shown
 from recon.reports import page
 from recon.reports.page import Section
 from sonotwin import study_plan
-from twin.accuracy import table_rows
-from twin.studies import (
-    beside_paper,
-    budget_page,
-    error_budget,
-    experiments,
-    factors,
-    rig_search,
-    search_page,
-    study_page,
-    study_runs,
-)
+from twin.experiments import experiment_runs, table_rows
+from twin.studies import beside_paper, budget_page, error_budget, factors, rig_search, search_page, study_page, study_runs
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
 from twin.studies.rig_search import Candidate, Goal
@@ -40,7 +30,7 @@ def sweep(config: "Config", console: Console) -> bool:
     if config.document is not None:
         table_rows.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
-    of = experiments.experiment(config.of)
+    of = experiment_runs.experiment(config.of)
     for figure, limit in of.limits.items():
         sign = "± " if (finite(one.figures.get(figure) for one in done) < 0).any() else ""  # an error, beside a size
         beside = f", {of.limit} {sign}{_range(done, limit)}" if limit else ""
@@ -124,7 +114,7 @@ def search(config: "Config", goal: Goal, console: Console) -> bool:
     if found is None:
         console.print("no best     no candidate kept all bounds")
     done = [one for candidate in candidates for one in candidate.done]
-    of = experiments.experiment(config.of)
+    of = experiment_runs.experiment(config.of)
     courses = study_page.plots(config.out, done, of) if len(done) >= FEWEST else []
     sections = [*search_page.sections(config.out, goal, candidates), *courses, study_page.points(done, of)]
     write(config, done, sections, console)
@@ -146,7 +136,7 @@ def opened(config: "Config") -> StudyFolder:
     """The study's folder, with a description of the study, which is its mark."""
     place = StudyFolder(config.out, config.trials)
     described = config.model_dump(mode="json", exclude={"out", "trials", "document", "given", "engine", "settings"})
-    place.open(described | {"settings": experiments.read_by(config.of, config.settings)})
+    place.open(described | {"settings": experiment_runs.read_by(config.of, config.settings)})
     return place
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sonotwin import config
-from twin.accuracy import kept_rows
+from twin.experiments import kept_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [

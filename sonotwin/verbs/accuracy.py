@@ -20,8 +20,8 @@ from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
 from recon.model.rig import Part, Rig
 from sonotwin.config import folder
-from twin.accuracy import kept_rows, table_rows
 from twin.conditions import Conditions
+from twin.experiments import kept_rows, table_rows
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
@@ -33,7 +33,7 @@ MODULES = {
     "session": "sonotwin.session_accuracy",
     "studies": "sonotwin.study_accuracy",
     "live": "sonotwin.live_accuracy",
-}  # of the others twin.accuracy.GROUP_accuracy
+}  # of the others twin.experiments.GROUP_accuracy
 
 
 class Config(Part):
@@ -67,7 +67,9 @@ def run(config: Config) -> int:
     met = True
     for group in groups:
         measured = []
-        for row in table_rows.measure(import_module(MODULES.get(group, f"twin.accuracy.{group}_accuracy")).measurements(setup)):
+        for row in table_rows.measure(
+            import_module(MODULES.get(group, f"twin.experiments.{group}_accuracy")).measurements(setup)
+        ):
             verdict = "    " if row.bar is None else "ok  " if row.ok else "MISS"
             asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)

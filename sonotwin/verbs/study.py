@@ -24,9 +24,9 @@ from sonotwin import study_steps
 from sonotwin.config import compose, defaults, folder
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
 from twin.engine import Engine
+from twin.experiments.experiment_runs import MODULES, Settings
 from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
-from twin.studies.experiments import MODULES, Settings
 from twin.studies.factors import Filling
 from twin.studies.rig_search import Goal
 from twin.working_range import working_range

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sonotwin.cli import main
-from twin.accuracy import kept_rows, optics_accuracy
-from twin.accuracy.table_rows import Row
+from twin.experiments import kept_rows, optics_accuracy
+from twin.experiments.table_rows import Row
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -16,7 +16,7 @@ from scenes.board_poses import Config as Poses
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
 from twin.conditions import IDEAL
-from twin.studies.drawn_session import Noise, calibrated_optics
+from twin.experiments.drawn_session import Noise, calibrated_optics
 
 LAG_S = 0.0473
 

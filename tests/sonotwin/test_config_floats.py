@@ -17,7 +17,7 @@ from recon.capture.manifest import Manifest
 from recon.errors import one_line
 from scenes import kinds
 from sonotwin.cli import VERBS
-from twin.studies.experiments import Settings
+from twin.experiments.experiment_runs import Settings
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 

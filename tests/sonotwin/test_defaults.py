@@ -13,8 +13,8 @@ from scenes.catalogue import parse_scene
 from sonotwin import config
 from sonotwin.cli import VERBS
 from sonotwin.config import compose, folder
+from twin.experiments.experiment_runs import Settings
 from twin.optics.light_transport import Tracing
-from twin.studies.experiments import Settings
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.transducer import Transducer
 

@@ -17,7 +17,7 @@ from sonotwin.cli import main
 from sonotwin.verbs import project
 from tests.recon import sweep_sets
 from tests.recon.devices.x_server import x_server
-from twin.accuracy.virtual_screen import screenshot
+from twin.experiments.virtual_screen import screenshot
 from twin.optics.surface_session import calibration_of
 
 BALL = np.array([2.0, -3.0, 680.0])

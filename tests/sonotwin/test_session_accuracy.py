@@ -6,8 +6,8 @@ import pytest
 from recon.errors import InputError
 from scenes.catalogue import build_scene
 from sonotwin import rendered_session, session_accuracy
-from twin.accuracy.table_rows import Setup
 from twin.evaluation import session_errors
+from twin.experiments.table_rows import Setup
 
 FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
 SCAN = {

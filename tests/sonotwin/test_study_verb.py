@@ -23,8 +23,9 @@ from sonotwin.verbs.study import Config
 from tests.patience import PATIENCE_S
 from tests.twin.studies.made_up import done
 from twin.conditions import Conditions
-from twin.studies import beside_paper, error_budget, experiments, factors, rig_search, surface_trial
-from twin.studies.drawn_session import Drawn
+from twin.experiments import experiment_runs, surface_trial
+from twin.experiments.drawn_session import Drawn
+from twin.studies import beside_paper, error_budget, factors, rig_search
 
 STUDIES = sorted(path.stem for path in (folder() / "study").glob("*.yaml"))
 SMALL = ["of=chain", "poses=demo", "poses.count=8", "noise.wires=12", "noise.scans=8"]
@@ -72,7 +73,7 @@ def test_the_budget_names_its_sources_alike(tmp_path):
     assert len(listed) == len(set(listed)) and {f"noise.drawn.{name}" for name in Drawn.model_fields} <= set(listed)
     settings = config.settings.model_dump(mode="json")
     assert all(factors.value_at(settings, field) > 0 for fields in sources.values() for field in fields)
-    assert set(config.budget.figures) == set(experiments.experiment(config.of).limits)
+    assert set(config.budget.figures) == set(experiment_runs.experiment(config.of).limits)
 
 
 def test_what_is_given_goes_before_what_the_study_says(tmp_path):

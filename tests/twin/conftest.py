@@ -13,11 +13,14 @@ from recon.capture.manifest import Device
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, Patterns
+from scenes.board_poses import Config as Poses
+from twin.experiments.experiment_runs import Settings
 
 SHRINK = 4  # of camera 1: 320x256 px
 CENTRE, RADIUS, WALL = np.array([4.0, -2.0, 650.0]), 19.8, 710.0  # mm
 LIGHT, AMBIENT, NOISE = 150.0, 10.0, 1.0  # DN
 NOTHING = 255
+CONF = Path(__file__).resolve().parents[2] / "conf"
 SHAPES = [
     {"kind": "sphere", "name": "ball", "centre": CENTRE.tolist(), "radius": RADIUS},
     {"kind": "plane", "name": "wall", "point": [0.0, 0.0, WALL], "normal": [0.0, 0.0, -1.0]},
@@ -36,8 +39,8 @@ class Session:
 
 @pytest.fixture(scope="module")
 def session(rig, tmp_path_factory) -> Session:
-    root = Path(__file__).resolve().parents[2]
-    patterns = Patterns.model_validate(yaml.safe_load((root / "conf/patterns/gray_surface.yaml").read_text(encoding="utf-8")))
+    written = (CONF / "patterns" / "gray_surface.yaml").read_text(encoding="utf-8")
+    patterns = Patterns.model_validate(yaml.safe_load(written))
     full, projector = rig.cam1.optics.camera(), rig.projector.optics.camera()
     shrink = np.diag([1 / SHRINK, 1 / SHRINK, 1.0])
     camera = replace(full, size=(full.size[0] // SHRINK, full.size[1] // SHRINK), matrix=shrink @ full.matrix)
@@ -100,3 +103,19 @@ def distance_to_ball(start, directions):
     along = directions @ offset
     inner = along**2 - (offset @ offset - RADIUS**2)
     return np.where(inner > 0, -along - np.sqrt(np.maximum(inner, 0)), np.inf)
+
+
+@pytest.fixture(scope="session")
+def settings(rig, scanners) -> Settings:
+    """The rig and the patterns of the paper, as in `conf/study.yaml`, and ten poses of the board."""
+    places = ("dataset", "patterns/paper_surface", "patterns/paper_calibration")
+    content = {name: yaml.safe_load((CONF / f"{name}.yaml").read_text(encoding="utf-8")) for name in places}
+    patterns = {name: Patterns.model_validate(content[f"patterns/{name}"]) for name in ("paper_surface", "paper_calibration")}
+    return Settings(
+        rig=rig,
+        patterns=patterns["paper_surface"],
+        board_patterns=patterns["paper_calibration"],
+        poses=Poses(count=10),
+        ultrasound=scanners["water"],
+        ranges=content["dataset"]["ranges"],
+    )

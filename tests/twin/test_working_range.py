@@ -8,9 +8,9 @@ from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
 from scenes.kinds import board, plane
 from sonotwin import choices
+from twin.experiments import drawn_session
+from twin.experiments.drawn_session import Noise
 from twin.optics.surface_session import calibration_of
-from twin.studies import drawn_session
-from twin.studies.drawn_session import Noise
 from twin.working_range import PAPER, working_range
 
 

@@ -1,1 +1,1 @@
-"""Studies: experiments of the twin over many settings and seeds, their tables, budgets and searches."""
+"""Studies: experiments over many settings and seeds, their tables, budgets and searches."""

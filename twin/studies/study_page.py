@@ -13,8 +13,8 @@ from recon.files import atomic
 from recon.files.metrics import shown
 from recon.reports import figures, page
 from recon.reports.page import Opening, Section
+from twin.experiments.experiment_runs import Experiment
 from twin.studies import study_plots, study_runs
-from twin.studies.experiments import Experiment
 from twin.studies.study_plots import Name, short, words
 from twin.studies.study_runs import ERROR, SEED, Done
 

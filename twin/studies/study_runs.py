@@ -22,8 +22,8 @@ from recon.errors import InputError
 from recon.files import atomic, json_text
 from recon.files.metrics import Metrics
 from twin.engine import Engine, results
-from twin.studies import experiments
-from twin.studies.experiments import Settings
+from twin.experiments import experiment_runs
+from twin.experiments.experiment_runs import Settings
 from twin.studies.factors import Point
 
 STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
@@ -115,7 +115,9 @@ class StudyFolder:
 
 def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int]) -> list[Trial]:
     """Trials of all points : (values, settings with these) and seeds, in order."""
-    return [Trial(experiments.digest(name, changed, seed), point, seed, changed) for point, changed in points for seed in seeds]
+    return [
+        Trial(experiment_runs.digest(name, changed, seed), point, seed, changed) for point, changed in points for seed in seeds
+    ]
 
 
 def run(folder: StudyFolder, name: str, trials: Sequence[Trial], engine: Engine) -> Iterator[Done]:
@@ -127,7 +129,7 @@ def run(folder: StudyFolder, name: str, trials: Sequence[Trial], engine: Engine)
         else:
             missing.setdefault(trial.key, []).append(trial)  # alike where a factor changes nothing
     tasks = ((key, name, alike[0].settings, alike[0].seed) for key, alike in missing.items())
-    for key, found in results(engine, experiments.run_trial, tasks):
+    for key, found in results(engine, experiment_runs.run_trial, tasks):
         for k, trial in enumerate(missing[key]):
             if k == 0:
                 folder.keep(Done(trial, found))

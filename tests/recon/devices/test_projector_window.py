@@ -16,7 +16,7 @@ from recon.devices.projector_window import ProjectorWindow
 from tests.patience import PATIENCE_S
 from tests.recon.devices.open_sockets import sockets
 from tests.recon.devices.x_server import covered, move_windows, set_output, set_ramp, x_server
-from twin.accuracy.virtual_screen import screenshot
+from twin.experiments.virtual_screen import screenshot
 
 SEQUENCES = sorted((Path(__file__).resolve().parents[3] / "conf/patterns").glob("*.yaml"))
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from pyglet.libs.x11 import xlib, xrandr
 
-from twin.accuracy import virtual_screen
+from twin.experiments import virtual_screen
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import pytest
 
 from recon.geometry.camera import Camera
 from recon.model.rig import Lens
-from twin.accuracy.optics_accuracy import STRONG_14
+from twin.experiments.optics_accuracy import STRONG_14
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays, transmission
 
 

@@ -12,7 +12,7 @@ from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Scene, Thing
 from tests.twin.small_rigs import cropped
-from twin.accuracy import optics_accuracy
+from twin.experiments import optics_accuracy
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import LUMENS_PER_WATT, Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern

@@ -16,7 +16,7 @@ from recon.model.patterns import Fringes
 from recon.structured_light.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
 from tests.twin.small_rigs import shrunk
-from twin.accuracy.optics_accuracy import paper_surface
+from twin.experiments.optics_accuracy import paper_surface
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Tracing, render
 from twin.optics.raster import Light

@@ -1,7 +1,7 @@
 """Trials whose figures are given, and an experiment that only adds: studies without their hours."""
 
-from twin.studies import experiments
-from twin.studies.experiments import Experiment, Settings
+from twin.experiments import experiment_runs
+from twin.experiments.experiment_runs import Experiment, Settings
 from twin.studies.study_runs import Done, Trial
 
 NAME = "sum"
@@ -26,5 +26,5 @@ EXPERIMENT = Experiment(("noise", "layout"), measure, {"sum_mm": "limit_mm"})
 
 def run_trial(key: str, name: str, settings: Settings, seed: int):
     """As that of `experiments`, in a worker that has no such experiment yet."""
-    experiments.MODULES[NAME] = __name__
-    return experiments.run_trial(key, name, settings, seed)
+    experiment_runs.MODULES[NAME] = __name__
+    return experiment_runs.run_trial(key, name, settings, seed)

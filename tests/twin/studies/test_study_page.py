@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.twin.studies.made_up import done
+from twin.experiments.experiment_runs import Experiment
 from twin.studies import budget_page, error_budget, rig_search, search_page, study_page, study_plots
 from twin.studies.error_budget import Budget, Contribution, Sum
-from twin.studies.experiments import Experiment
 from twin.studies.rig_search import Bound, Candidate, Goal
 
 LIMITS = {"error_mm": "limit_mm", "turn_deg": ""}

@@ -10,8 +10,9 @@ from recon.errors import InputError
 from recon.files.code_digest import code_digest
 from tests.twin.studies import made_up
 from twin.engine import Engine
-from twin.studies import experiments, factors, study_runs
-from twin.studies.experiments import Settings
+from twin.experiments import experiment_runs
+from twin.experiments.experiment_runs import Settings
+from twin.studies import factors, study_runs
 from twin.studies.study_runs import StudyFolder
 
 HERE = Engine()
@@ -22,7 +23,7 @@ SPEED, SCALE = "noise.speed_mm_s", "layout.target_scale"
 @pytest.fixture(autouse=True)
 def experiment(monkeypatch):
     """A made-up one among the others."""
-    monkeypatch.setitem(experiments.MODULES, made_up.NAME, made_up.__name__)
+    monkeypatch.setitem(experiment_runs.MODULES, made_up.NAME, made_up.__name__)
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def counted(monkeypatch) -> list:
         taken.append((settings.noise.speed_mm_s, seed))
         return made_up.measure(settings, seed)
 
-    experiment = experiments.Experiment(made_up.EXPERIMENT.reads, measure, made_up.EXPERIMENT.limits)
+    experiment = experiment_runs.Experiment(made_up.EXPERIMENT.reads, measure, made_up.EXPERIMENT.limits)
     monkeypatch.setattr(made_up, "EXPERIMENT", experiment)
     return taken
 
@@ -108,7 +109,7 @@ def test_a_trial_that_measures_nothing_is_a_row_with_its_reason(settings, place,
 
 def test_other_errors_are_the_callers(settings, place, monkeypatch):
     """A mistake of the software is not a property of the settings."""
-    broken = experiments.Experiment(("noise",), lambda settings, seed: {}["figure"], {})
+    broken = experiment_runs.Experiment(("noise",), lambda settings, seed: {}["figure"], {})
     monkeypatch.setattr(made_up, "EXPERIMENT", broken)
     with pytest.raises(KeyError, match="figure"):
         measured(place, planned(settings, {SPEED: [10]}))
@@ -127,32 +128,32 @@ def test_a_trials_name_is_all_that_its_figures_depend_on(settings, monkeypatch):
     others = [planned(settings, {SPEED: [11]}, (0,)), planned(settings, {SPEED: [10]}, (1,))]
     elsewhere = settings.model_copy(update={"film": settings.film.model_copy(update={"frames": 77})})
     assert planned(elsewhere, {SPEED: [10]}, (0,))[0].key == key
-    assert experiments.digest("chain", settings, 0) != experiments.digest("laboratory", settings, 0)
-    monkeypatch.setattr(experiments, "version", lambda: "of other code")
+    assert experiment_runs.digest("chain", settings, 0) != experiment_runs.digest("laboratory", settings, 0)
+    monkeypatch.setattr(experiment_runs, "version", lambda: "of other code")
     others.append(planned(settings, {SPEED: [10]}, (0,)))
     assert len({key, *(one.key for (one,) in others)}) == 4
 
 
 def test_a_version_is_that_of_code_libraries_and_the_ray_tracer(monkeypatch):
     """Each of them changes it; it is found once."""
-    version = experiments.version.__wrapped__
+    version = experiment_runs.version.__wrapped__
     found = [version()]
     for place, name, other in (
-        (experiments, "code_digest", lambda *packages: "of other code"),
-        (experiments.importlib.metadata, "version", lambda library: "0.1" if library == "scipy" else "1.0"),
-        (experiments.importlib.metadata, "version", lambda library: "0.1" if library == "onnxruntime" else "1.0"),
-        (experiments, "prepare", lambda: "of a processor that nobody has"),
+        (experiment_runs, "code_digest", lambda *packages: "of other code"),
+        (experiment_runs.importlib.metadata, "version", lambda library: "0.1" if library == "scipy" else "1.0"),
+        (experiment_runs.importlib.metadata, "version", lambda library: "0.1" if library == "onnxruntime" else "1.0"),
+        (experiment_runs, "prepare", lambda: "of a processor that nobody has"),
     ):
         monkeypatch.setattr(place, name, other)
         found.append(version())
     assert len(set(found)) == 5 and version() == found[-1]
-    assert experiments.version() is experiments.version() and len(found[0]) == 12
+    assert experiment_runs.version() is experiment_runs.version() and len(found[0]) == 12
 
 
 def test_workers_of_another_version_refuse(settings, place, monkeypatch):
     """Their figures would be kept under the name of this machine's."""
     trials = planned(settings, {SPEED: [10]}, (0,))
-    monkeypatch.setattr(experiments, "version", lambda: "of other code")
+    monkeypatch.setattr(experiment_runs, "version", lambda: "of other code")
     with pytest.raises(InputError, match="engine: expected workers with the code and the libraries of this machine, found"):
         measured(place, trials)
     assert not list(place.trials.iterdir())
@@ -161,7 +162,7 @@ def test_workers_of_another_version_refuse(settings, place, monkeypatch):
 @pytest.mark.parametrize("engine", [HERE, Engine(workers=2)], ids=["this process", "two processes"])
 def test_tables_are_the_same_bytes_whatever_the_engine(settings, place, tmp_path, monkeypatch, engine):
     """And whether a study was stopped in between. Workers find the code as it is now, which may be edited while tests run."""
-    for kept in (code_digest, experiments.version):
+    for kept in (code_digest, experiment_runs.version):
         kept.cache_clear()
     over = {SPEED: {"from": 10, "to": 90, "count": 5}, SCALE: [1.0, 2.0]}
     expected = StudyFolder(tmp_path / "plain")
@@ -171,7 +172,7 @@ def test_tables_are_the_same_bytes_whatever_the_engine(settings, place, tmp_path
     next(running)
     running.close()
     if engine.workers > 1:
-        monkeypatch.setattr(experiments, "run_trial", made_up.run_trial)
+        monkeypatch.setattr(experiment_runs, "run_trial", made_up.run_trial)
     place.write_table(measured(place, planned(settings, over), engine))
     table = (place.folder / study_runs.TABLE).read_bytes()
     assert table == (expected.folder / study_runs.TABLE).read_bytes()
@@ -262,16 +263,16 @@ def test_a_file_of_the_same_name_is_left_alone(content, tmp_path):
 
 
 def test_fields_that_an_experiment_does_not_read_are_refused():
-    experiments.check_reads("surface", ["shooting.exposure_s", "rig.projector.gamma"])
+    experiment_runs.check_reads("surface", ["shooting.exposure_s", "rig.projector.gamma"])
     with pytest.raises(
         InputError, match=r"over: noise\.board_px: expected a field that of=surface reads, of rig, layout\.projector_mm,"
     ):
-        experiments.check_reads("surface", ["shooting.exposure_s", "noise.board_px"])
+        experiment_runs.check_reads("surface", ["shooting.exposure_s", "noise.board_px"])
 
 
 def test_parts_of_a_field_that_would_change_nothing_are_refused():
     """Of conditions the chain reads some; a whole that holds one of them, and a part of one, are read."""
-    experiments.check_reads(
+    experiment_runs.check_reads(
         "chain",
         [
             "rig.probe",
@@ -290,14 +291,14 @@ def test_parts_of_a_field_that_would_change_nothing_are_refused():
         "nois",
     ):
         with pytest.raises(InputError, match=rf"over: {inert}: expected a field that of=chain reads, .* would change nothing"):
-            experiments.check_reads("chain", ["noise", inert])
+            experiment_runs.check_reads("chain", ["noise", inert])
 
 
-@pytest.mark.parametrize("name", experiments.MODULES)
+@pytest.mark.parametrize("name", experiment_runs.MODULES)
 def test_experiments_read_settings_and_have_limits(name, settings):
     """Their dotted names are fields, and the limits have a name."""
-    found, base = experiments.experiment(name), settings.model_dump(mode="json")
+    found, base = experiment_runs.experiment(name), settings.model_dump(mode="json")
     for field in found.reads:
         factors.value_at(base, field)
     assert found.limits and found.limit
-    assert set(experiments.read_by(name, settings)) == {field.partition(".")[0] for field in found.reads}
+    assert set(experiment_runs.read_by(name, settings)) == {field.partition(".")[0] for field in found.reads}

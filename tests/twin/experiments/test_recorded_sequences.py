@@ -1,0 +1,38 @@
+"""Rows of tracked sequences: exact, read whole, and refused when damaged."""
+
+import numpy as np
+
+from recon.freehand import sequences
+from twin.experiments import recorded_sequences
+from twin.experiments.table_rows import Setup
+
+
+def check(rows) -> None:
+    """Every bar is met."""
+    assert not [row for row in rows if not row.ok]
+
+
+def test_sequences_are_the_same_after_writing_and_reading():
+    check(recorded_sequences.round_trip())
+
+
+def test_damaged_sequences_are_refused():
+    check(recorded_sequences.damaged())
+
+
+def test_a_changed_pose_is_not_the_same(monkeypatch):
+    """The row can fail: one number off by the last bit is seen."""
+    read = sequences.read_sequence
+
+    def nearly(path):
+        frames = read(path)
+        frames.transforms["ProbeToTracker"][1, 0, 0] = np.nextafter(frames.transforms["ProbeToTracker"][1, 0, 0], 2)
+        return frames
+
+    monkeypatch.setattr(sequences, "read_sequence", nearly)
+    assert not recorded_sequences.round_trip()[0].ok
+
+
+def test_the_real_sweep(real, rig):
+    check(recorded_sequences.real_sweep(Setup(rig, {}, real)))
+    check(recorded_sequences.real_file(Setup(rig, {}, real)))

@@ -1,0 +1,78 @@
+"""The rows of the accuracy tables, as far as they are quick, and the statistic for surfaces without truth."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.capture.surface_part import read_patterns
+from tests.twin.small_rigs import shrunk
+from twin.experiments import optics_accuracy, surface_accuracy
+from twin.experiments.table_rows import Setup
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def setup(rig) -> Setup:
+    """The rig, with images of half the size, and the sequences of `conf/patterns`."""
+    half = rig.model_copy(update={"cam1": shrunk(rig.cam1, 2)})
+    return Setup(half, {path.stem: read_patterns(path) for path in (ROOT / "conf" / "patterns").glob("*.yaml")})
+
+
+def check(rows) -> None:
+    """Every bar is met."""
+    assert not [row for row in rows if not row.ok]
+
+
+@pytest.mark.parametrize("pose", [0, pytest.param(4, marks=pytest.mark.slow)])
+def test_planes_of_the_paper(setup, pose):
+    """Nearest and farthest plane: RMS within 1.25 of what noise allows, errors as large as predicted."""
+    check(surface_accuracy.planes(setup, pose))
+
+
+def test_sphere_of_the_paper(setup):
+    """Radius within 0.02 mm, RMS within 0.04 mm."""
+    check(surface_accuracy.sphere(setup))
+
+
+def test_breast(setup, rig):
+    """Coverage, RMS, hardly a point off by more than 1 mm: in images of full size, whose fringes can be followed everywhere."""
+    check(surface_accuracy.breast(replace(setup, rig=rig)))
+
+
+@pytest.mark.slow
+def test_no_wrong_order_survives(setup):
+    """Deep steps and shadows: no point on a wrong order, and what the centre line doesn't reach is said to be so."""
+    check(surface_accuracy.orders_under_stress(setup))
+
+
+def test_real_relief(setup, real):
+    """A recording of others: enough points, in the right depth, and sigma as large as the local residual."""
+    check(surface_accuracy.real_capture(replace(setup, real=real)))
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients"), [("realistic", optics_accuracy.REALISTIC_14), ("strong", optics_accuracy.STRONG_14)]
+)
+def test_round_trip(name, coefficients):
+    """Pixel to ray to pixel through all 14 coefficients, everywhere in the image."""
+    check([optics_accuracy.round_trip(name, coefficients)])
+
+
+@pytest.mark.parametrize("told", [1.0, 0.5])
+def test_noise_is_told_from_shape(rng, told):
+    """On a curved surface with known noise the ratio is that of the noise to what sigma claims (3 %)."""
+    v, u = np.mgrid[:300, :400]
+    distance = np.float32(650 + 2e-4 * (u - 200) ** 2 + 1e-4 * u * v + rng.normal(0, 0.05, u.shape))
+    ratio = surface_accuracy.smooth_noise_ratio(distance, np.full(u.shape, 0.05 * told, np.float32))
+    assert ratio == pytest.approx(1 / told, rel=0.03)
+
+
+def test_gaps_are_left_out(rng):
+    """Patches with a hole don't count, whatever is in the hole's place."""
+    distance = np.float32(650 + rng.normal(0, 0.05, (90, 90)))
+    distance[10, 10] = np.nan
+    ratio = surface_accuracy.smooth_noise_ratio(distance, np.full(distance.shape, 0.05, np.float32))
+    assert ratio == pytest.approx(1, rel=0.1)

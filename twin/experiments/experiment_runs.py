@@ -1,0 +1,165 @@
+"""Experiments that studies are made of: from settings and a seed to figures, on any machine the same.
+
+A trial is one run of an experiment. Each experiment reads some of the settings, so a factor among the others is refused, and a
+trial that is kept isn't done anew when these change.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from socket import gethostname
+from typing import Annotated, Any
+
+import cv2
+from pydantic import Field, field_validator, model_validator
+
+from recon.errors import InputError
+from recon.files.code_digest import code_digest
+from recon.files.metrics import Metrics
+from recon.model.patterns import Patterns
+from recon.model.rig import Part, Positive, Rig
+from scenes.board_poses import Config as BoardPoses
+from scenes.kinds.board import Config as Board
+from twin.conditions import IDEAL, Conditions
+from twin.experiments.drawn_session import ROLL_DEG, Noise
+from twin.experiments.layout import Layout
+from twin.llvm import prepare
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import Shooting
+from twin.shooting import power_of_two
+from twin.tracking.sampling_ranges import DataRanges
+from twin.ultrasound.probe_path import WirePath
+from twin.ultrasound.transducer import Transducer, check_scanner
+
+MODULES = {  # where an experiment's EXPERIMENT is
+    "surface": "twin.experiments.surface_trial",
+    "calibration": "twin.experiments.calibration_trial",
+    "tracking": "twin.experiments.tracking_trial",
+    "laboratory": "twin.experiments.laboratory_trial",
+    "chain": "twin.experiments.chain_trial",
+    "tank": "twin.experiments.tank_trial",
+    "breast": "twin.experiments.breast_trial",
+}
+DIGITS = 6  # significant, of figures
+PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "mitsuba", "drjit", "onnxruntime")
+
+
+class Plane(Part):
+    """Where a plane stands that is measured."""
+
+    depth_mm: Positive | None = None  # z of its middle; the paper's five planes in turn, 622 to 698 mm, if not given
+
+
+class Film(Part):
+    """Frames of the tracked target."""
+
+    frames: Annotated[int, Field(ge=1, le=10_000)] = 12  # pairs, each in a pose of its own
+    white_dn: Positive = 65.0  # of 255, of the target's paper
+    blur_px: Annotated[float, Field(ge=0, le=100)] = 0.0  # by which the target's middle moves while a frame is exposed
+    rays: Annotated[int, Field(ge=2, le=1024)] = 64  # a pixel, a power of two; few leave noise of rendering
+
+    _power_of_two = field_validator("rays")(power_of_two)
+
+
+class Settings(Part):
+    """All that experiments are made from; as in `conf/study.yaml`."""
+
+    rig: Rig
+    layout: Layout = Layout()
+    patterns: Patterns  # over surfaces
+    board_patterns: Patterns
+    board: Board = Board()
+    poses: BoardPoses = BoardPoses()
+    conditions: Conditions = IDEAL
+    tracing: Tracing = Tracing()
+    shooting: Shooting = Shooting()
+    plane: Plane = Plane()
+    film: Film = Film()
+    noise: Noise = Noise()
+    wire_path: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
+    ultrasound: Transducer = Transducer()
+    ranges: DataRanges
+
+    @model_validator(mode="after")
+    def _fit(self) -> "Settings":
+        raster = self.rig.projector.optics.size
+        for name in ("patterns", "board_patterns"):
+            if (shown := getattr(self, name).projector_size) != raster:
+                raise ValueError(f"{name}.projector_size: expected the rig's {list(raster)}, found {list(shown)}")
+        if not self.patterns.has_fringes("columns"):
+            raise ValueError("patterns: expected fringes along columns, which closed forms are of, found none")
+        check_scanner(self.rig, self.ultrasound)
+        return self
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One kind of trial."""
+
+    reads: tuple[str, ...]  # fields of the settings, or parts of fields, by dotted names
+    measure: Callable[[Settings, int], Metrics]  # figures by name, the unit in the name, of settings and a seed
+    limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
+    limit: str = "closed form"  # what these are
+
+
+def experiment(name: str) -> Experiment:
+    """An experiment by its name."""
+    return import_module(MODULES[name]).EXPERIMENT
+
+
+def check_reads(name: str, fields: Iterable[str]) -> None:
+    """Refuse fields that an experiment doesn't read; raises InputError with the name of one."""
+    reads = experiment(name).reads
+    for field in fields:
+        if not any(f"{field}.".startswith(f"{read}.") or f"{read}.".startswith(f"{field}.") for read in reads):
+            raise InputError(
+                f"over: {field}: expected a field that of={name} reads, of {', '.join(reads)}; it would change nothing"
+            )
+
+
+def read_by(name: str, settings: Settings) -> dict[str, Any]:
+    """The settings that an experiment reads, as JSON has them."""
+    return settings.model_dump(mode="json", include={read.partition(".")[0] for read in experiment(name).reads})
+
+
+@cache
+def version() -> str:
+    """Digest of all that a trial's figures depend on beside its settings and its seed: code, libraries and the ray tracer's."""
+    libraries = {name: importlib.metadata.version(name) for name in LIBRARIES}
+    content = json.dumps([code_digest(*PACKAGES), libraries, prepare()], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:12]
+
+
+def digest(name: str, settings: Settings, seed: int) -> str:
+    """Name of a trial: by all that its figures depend on."""
+    content = json.dumps([version(), name, read_by(name, settings), seed], sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()[:20]
+
+
+def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, Metrics | str]:
+    """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with.
+
+    Figures have DIGITS significant digits: those beyond the eleventh of what they are made of may depend on where linear algebra
+    finds its buffers.
+
+    Raises
+    ------
+    InputError
+        If this machine's code or libraries aren't those of who asks.
+    """
+    if digest(name, settings, seed) != key:
+        raise InputError(
+            f"engine: expected workers with the code and the libraries of this machine, found others at {gethostname()}; "
+            "was code edited since the study began? start it again"
+        )
+    measure = experiment(name).measure
+    try:
+        return key, {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
+    except (ValueError, cv2.error) as error:  # InputError too
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        return key, kind + " ".join(str(error).split())

@@ -1,0 +1,197 @@
+"""All measured rows as one CSV file beside a document, and the document's short table of some of them.
+
+CSV rather than Parquet, as a commit then shows which figures changed, and a forge shows and filters the file.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
+from pathlib import Path
+from re import search
+
+from recon.errors import InputError
+from recon.files import atomic, yaml_text
+from twin.experiments import table_rows
+from twin.experiments.table_rows import Row
+
+MARK = "rows"  # of the short table's place in a document
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A row with its group and the state of the code that gave it; the file's columns are these fields."""
+
+    group: str
+    id: str
+    what: str
+    measured: float
+    sense: str  # <= or >=; empty without a bar
+    bar: float | None
+    limit: float | None
+    unit: str
+    met: bool | None  # by all digits; none without a bar
+    day: str  # UTC
+    commit: str  # two where later steps of a measurement were repeated
+
+    @property
+    def strain(self) -> float:
+        """Measured over bar, or its inverse where at least the bar is asked; without a bar below zero."""
+        if self.bar is None:
+            return -1.0
+        above, below = (self.bar, self.measured) if self.sense == ">=" else (self.measured, self.bar)
+        if math.isnan(above) or math.isnan(below):
+            return math.inf
+        return above / below if below > 0 else (math.inf if above > below else 0.0)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A row of the short table: kept rows in words, of which the worst is shown."""
+
+    quantity: str
+    conditions: str
+    rows: tuple[str, ...]  # patterns of `GROUP ID WHAT`, with * and ?
+
+
+def kept(group: str, row: Row, day: str, commit: str) -> Kept:
+    """Give a measured row its group, day and commit."""
+    asked = row.bar is not None
+    sense = "" if not asked else ">=" if row.at_least else "<="
+    met = row.ok if asked else None
+    return Kept(group, row.id, row.what, row.measured, sense, row.bar, row.limit, row.unit, met, day, commit)
+
+
+def file_of(document: Path) -> Path:
+    """Path of the rows of a document: `accuracy.csv` beside `accuracy.md`."""
+    return document.with_suffix(".csv")
+
+
+def read(path: Path) -> list[Kept]:
+    """Read all rows; none if there is no file yet.
+
+    Raises
+    ------
+    InputError
+        If the file isn't one that `write` has written.
+    """
+    if not path.exists():
+        return []
+    try:
+        table = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), strict=True))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: expected rows as CSV, found {error}") from error
+    names = [field.name for field in fields(Kept)]
+    if not table or table[0] != names:
+        raise InputError(f"{path}: line 1: expected {','.join(names)}, found {','.join(table[0]) if table else 'nothing'}")
+    found = []
+    for k, cells in enumerate(table[1:], start=2):
+        try:
+            found.append(_row_of(*cells))
+        except (TypeError, ValueError, KeyError) as error:
+            raise InputError(f"{path}: line {k}: expected a row of {len(names)} cells, found {','.join(cells)}") from error
+    return found
+
+
+def _row_of(
+    group: str, id: str, what: str, measured: str, sense: str, bar: str, limit: str, unit: str, met: str, day: str, commit: str
+) -> Kept:
+    asked, beside = (float(text) if text else None for text in (bar, limit))
+    verdict = {"": None, "yes": True, "no": False}[met]
+    return Kept(group, id, what, float(measured), sense, asked, beside, unit, verdict, day, commit)
+
+
+def write(path: Path, rows: Sequence[Kept]) -> None:
+    """Write all rows, figures by four digits as in the tables."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([field.name for field in fields(Kept)])
+    table.writerows([_cell(getattr(row, field.name)) for field in fields(Kept)] for row in rows)
+    with atomic.new_file(path) as temporary:
+        temporary.write_text(text.getvalue(), encoding="utf-8")
+
+
+def _cell(value: str | float | bool | None) -> str:
+    if value is None or isinstance(value, str):
+        return value or ""
+    return ("no", "yes")[value] if isinstance(value, bool) else f"{value:.4g}"
+
+
+def enter(document: Path, choices: Sequence[Chosen], group: str, measured: Sequence[Row]) -> None:
+    """Replace a group's rows in the file beside a document, with today and the commit, and make the document's table anew.
+
+    The file is locked from reading to writing, so that two processes that enter different groups lose none.
+    """
+    day, commit = table_rows.state(document.parent)
+    path = file_of(document)
+    with atomic.new_file(path) as temporary:
+        rows = renewed(read(path), group, [kept(group, row, day, commit) for row in measured])
+        write(temporary, rows)
+        table_rows.enter(document, MARK, short_table(rows, choices))
+
+
+def show(document: Path, choices: Sequence[Chosen]) -> None:
+    """Make a document's table anew of the file beside it, after a change of the choices."""
+    table_rows.enter(document, MARK, short_table(read(file_of(document)), choices))
+
+
+def renewed(rows: Sequence[Kept], group: str, measured: Sequence[Kept]) -> list[Kept]:
+    """Rows with those of a group replaced where they stood; a new group comes last."""
+    place = next((k for k, row in enumerate(rows) if row.group == group), len(rows))
+    before = [row for row in rows[:place] if row.group != group]
+    return [*before, *measured, *(row for row in rows[place:] if row.group != group)]
+
+
+def read_choices(path: Path) -> list[Chosen]:
+    """Read which rows a document shows: a YAML list of `quantity`, `conditions` and `rows`, a pattern or several.
+
+    Raises
+    ------
+    InputError
+        If an entry has other fields.
+    """
+    found = []
+    for k, entry in enumerate(yaml_text.read(path)):
+        if not isinstance(entry, dict) or set(entry) != {"quantity", "conditions", "rows"}:
+            raise InputError(f"{path}: entry {k + 1}: expected quantity, conditions and rows, found {entry}")
+        rows = [entry["rows"]] if isinstance(entry["rows"], str) else entry["rows"]
+        found.append(Chosen(str(entry["quantity"]), str(entry["conditions"] or ""), tuple(rows)))
+    return found
+
+
+def chosen_rows(rows: Sequence[Kept], choice: Chosen) -> list[Kept]:
+    """Rows that fit a choice."""
+    return [row for row in rows if any(fnmatchcase(f"{row.group} {row.id} {row.what}", pattern) for pattern in choice.rows)]
+
+
+def short_table(rows: Sequence[Kept], choices: Sequence[Chosen]) -> str:
+    """The table of a document: a line a choice, missed ones first; a missed row that no choice covers has a line of its own."""
+    covered = {row for choice in choices for row in chosen_rows(rows, choice)}
+    choices = [*choices, *(_alone(row) for row in rows if row.met is False and row not in covered)]
+    lines, missed = [], []
+    for choice in choices:
+        found = chosen_rows(rows, choice) if choice.rows else [row for row in rows if _alone(row) == choice]
+        worst = max(found, key=lambda row: (row.met is False, row.strain), default=None)
+        (missed if worst is not None and worst.met is False else lines).append(_line(choice, worst, len(found)))
+    days = sorted(row.day for row in rows) or [""]
+    head = f"Measured from {days[0]} to {days[-1]}; {len(rows)} rows, {sum(row.met is False for row in rows)} missed."
+    names = "| quantity | conditions | measured | bar | limit | paper | met |\n|---|---|---|---|---|---|---|"
+    return "\n".join([head, "", names, *missed, *lines])
+
+
+def _alone(row: Kept) -> Chosen:
+    return Chosen(row.what, f"{row.group}, row {row.id}", ())
+
+
+def _line(choice: Chosen, row: Kept | None, count: int) -> str:
+    if row is None:
+        return f"| {choice.quantity} | {choice.conditions} | not measured | | | | |"
+    found = search(r"[(;] ?paper(?:, [\w ]+)?: ([^);]+)", row.what)
+    paper = " to ".join(dict.fromkeys(found[1].split(" to "))) if found else ""  # 0.04 to 0.04 is one figure
+    figure = f"{row.measured:.4g} {row.unit}".strip() + (f", worst of {count}" if count > 1 else "")
+    asked = "" if row.bar is None else f"{row.sense} {row.bar:.4g}"
+    beside = "" if row.limit is None or math.isnan(row.limit) else f"{row.limit:.4g}"
+    met = {None: "", True: "yes", False: "**no**"}[row.met]
+    return f"| {choice.quantity} | {choice.conditions} | {figure} | {asked} | {beside} | {paper} | {met} |"

@@ -1,0 +1,301 @@
+"""Accuracy of the probe's calibration, from the twin's own B-scans of crossed wires."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Rig
+from recon.probe_calibration import point_calibration, repeatability, sound_in_water, wires
+from recon.probe_calibration.point_calibration import Adjustment, Noise, Sightings
+from scenes.acoustics import TISSUES
+from scenes.kinds import crosswire
+from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.ultrasound.bscan import scans
+from twin.ultrasound.echo_solids import Body, body
+from twin.ultrasound.probe_path import WirePath, about_crossing, held
+from twin.ultrasound.sweep_session import calibration_of
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+CALIBRATIONS, IMAGES = 5, 30  # as in Meza et al. 2021
+ROLL_DEG = 90.0  # as far as a wrist goes
+TURN_DEG, SHIFT_MM = 0.08, 0.05  # standard deviations of the tracked pose, in each axis
+REPEATS = 4  # of the five calibrations, with other errors of the poses
+WRONG = 0.3  # share of outliers
+REGION = 0.95
+TEMPERATURE_C = 22.0  # of the scene's water
+DEPTH_MM = 50.0  # shown, at which depths are compared
+WIRE_MM = 0.1  # radius of the scene's wires
+FEW = 20  # frames of a motion that is to be refused
+ALMOST_MM = 1e-3  # noise of a crossing that is known
+PAPER = {"CR1": (0.434, 0.551, 0.591), "CR2": (0.274, 0.345, 0.368)}  # mm
+BARS = {"CR1": (0.20, 0.25, 0.30), "CR2": (0.13, 0.17, 0.20)}  # mm
+PLACES = ("centre", "corners, mean of four", "mean of five points")
+PAPER_AT = ("", ", one corner", "")
+TRUE_MM = 0.30
+LEFT_HANDED, X_AND_Y = np.diag([1.0, 1, -1, 1]), np.eye(4)[[1, 0, 2, 3]]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """B-scans of crossed wires, in n poses: where the crossing was found, and where it is."""
+
+    world_from_image: Array  # (n, 4, 4) mm, true
+    found: Sightings  # of the m frames in which a crossing was found, with true poses of the image instead of the target's
+    numbers: NDArray[np.int64]  # (m,) of these frames
+    pixels: Array  # (n, 2) px, true: the crossing, projected into the image plane
+    beside: Array  # (n,) mm, true: of the crossing from the image plane
+
+
+def measurements(setup: Setup) -> list[Measurement]:
+    """The rows of the group, at full size."""
+    return [
+        lambda: repeats(setup, recorded(setup.rig, setup.scanners["water"])),
+        lambda: outliers(setup, recorded(setup.rig, setup.scanners["water"])),
+        lambda: refusals(setup, recorded(setup.rig, setup.scanners["water"])),
+        lambda: sound(setup, recorded(setup.rig, setup.scanners["water"])),
+    ]
+
+
+@cache
+def recorded(rig: Rig, transducer: Transducer, count: int = CALIBRATIONS * IMAGES) -> Frames:
+    """Take B-scans along the path of the protocol, and find the crossing in them."""
+    wired = body(crosswire.build(crosswire.Config(diameter_mm=2 * WIRE_MM)))
+    track, _ = about_crossing(WirePath(count=count, roll_deg=ROLL_DEG), wired, transducer)
+    return looked_at(wired, transducer, track.poses[:: len(track.poses) // count])
+
+
+def looked_at(wired: Body, transducer: Transducer, world_from_image: Array) -> Frames:
+    """Take a B-scan in each of n poses : (n, 4, 4), and find the crossing."""
+    images = (taken.image for taken in scans(wired, transducer, world_from_image, 0))
+    found, crossings = point_calibration.from_images(images, world_from_image)
+    middle = np.mean([wire.ends.mean(axis=0) for wire in wired.wires], axis=0)
+    local = np.stack([rigid.apply(rigid.invert(pose), middle) for pose in world_from_image])
+    scale = np.array(transducer.scale_mm_per_px) * [1, wired.medium.speed / transducer.assumed_speed]
+    numbers = np.flatnonzero([crossing.found for crossing in crossings])
+    return Frames(world_from_image, found, numbers, local[:, :2] / scale, local[:, 2])
+
+
+def tracked(rig: Rig, world_from_image: Array, rng: np.random.Generator) -> Array:
+    """Poses `world_from_target` : (n, 4, 4) as a tracker reports them, with independent errors."""
+    poses = world_from_image @ rigid.invert(rig.probe.target_from_image.matrix())
+    turns, shifts = np.radians(TURN_DEG) * rng.standard_normal((len(poses), 3)), SHIFT_MM * rng.standard_normal((len(poses), 3))
+    noisy = np.stack([pose @ rigid.from_rotation_vector(turn, np.zeros(3)) for pose, turn in zip(poses, turns, strict=True)])
+    noisy[:, :3, 3] += shifts
+    return noisy
+
+
+def blocks(frames: Frames) -> list[NDArray[np.int64]]:
+    """Numbers of the sightings of each calibration's 30 images; those without a crossing aren't replaced."""
+    calibrations = len(frames.world_from_image) // IMAGES
+    return [np.flatnonzero(frames.numbers // IMAGES == k) for k in range(calibrations)]
+
+
+def calibrated(rig: Rig, sightings: Sightings, rng: np.random.Generator) -> Adjustment:
+    """Calibrate from sightings with the image's poses, tracked with errors."""
+    noise = Noise(TURN_DEG, SHIFT_MM)
+    ahead = wires.echo_ahead(WIRE_MM, TISSUES["nylon"].speed, float(sound_in_water.speed_of_sound(TEMPERATURE_C)))
+    seen = replace(sightings, poses=tracked(rig, sightings.poses, rng))
+    return point_calibration.calibrate(seen, rig.probe.image_size, noise, rig.probe.target_from_image.matrix(), ahead_mm=ahead)
+
+
+def calibrated_exactly(rig: Rig, frames: Frames, block: NDArray[np.int64], rng: np.random.Generator) -> ProbeCalibration:
+    """Calibrate from the same poses, brought to have the crossing in the image plane, and the true pixels."""
+    chosen = frames.numbers[block]
+    moved = frames.world_from_image[chosen].copy()
+    moved[:, :3, 3] += moved[:, :3, 2] * frames.beside[chosen, None]
+    noise = Noise(TURN_DEG, SHIFT_MM, ALMOST_MM, ALMOST_MM)
+    seen = Sightings(tracked(rig, moved, rng), frames.pixels[chosen])
+    return point_calibration.calibrate(seen, rig.probe.image_size, noise).calibration
+
+
+def in_water(setup: Setup) -> ProbeCalibration:
+    """The true calibration for images of the scene's water."""
+    truth = calibration_of(setup.rig, setup.scanners["water"])
+    return sound_in_water.in_medium(truth, truth.speed_m_s, float(sound_in_water.speed_of_sound(TEMPERATURE_C)))
+
+
+def errors(found: Sequence[ProbeCalibration], truth: ProbeCalibration, rig: Rig) -> Array:
+    """Distances : (n, 5) mm of five points from where they are, by each of n calibrations."""
+    points = repeatability.five_points(rig.probe.image_size)
+    return np.stack([np.linalg.norm(each.to_target(points) - truth.to_target(points), axis=1) for each in found])
+
+
+def repeatabilities(found: Sequence[ProbeCalibration], rig: Rig) -> Array:
+    """CR1 and CR2 : (2, 3) mm at PLACES."""
+    points = repeatability.five_points(rig.probe.image_size)
+    both = np.stack([repeatability.cr1(found, points), repeatability.cr2(found, points)])
+    return np.column_stack([both[:, 0], both[:, 1:].mean(axis=1), both.mean(axis=1)])
+
+
+def squared_length(found: ProbeCalibration, truth: ProbeCalibration) -> float:
+    """Squared error of the eight parameters in units of their covariance; 8 are expected."""
+    assert found.uncertainty is not None
+    error = np.concatenate([truth.scale - found.scale, rigid.difference(found.target_from_image, truth.target_from_image)])
+    return float(error @ np.linalg.solve(found.uncertainty.covariance, error))
+
+
+@cache
+def sets(rig: Rig, frames: Frames) -> tuple[list[list[Adjustment]], list[list[ProbeCalibration]]]:
+    """Calibrations of all blocks, by found crossings and by true ones, each set with other errors of the poses."""
+    by_images, exact = [], []
+    for repeat in range(REPEATS):
+        rng = np.random.default_rng([1, repeat])
+        by_images.append([calibrated(rig, frames.found.of(block), rng) for block in blocks(frames)])
+        rng = np.random.default_rng([1, repeat])
+        exact.append([calibrated_exactly(rig, frames, block, rng) for block in blocks(frames)])
+    return by_images, exact
+
+
+def repeats(setup: Setup, frames: Frames) -> list[Row]:
+    """Row d: five calibrations agree, and are right; the limit is that of the poses' errors alone."""
+    rig, truth = setup.rig, in_water(setup)
+    by_images, exact = sets(rig, frames)
+    found = [[each.calibration for each in one] for one in by_images]
+    figures = np.mean([repeatabilities(one, rig) for one in found], axis=0)
+    limits = np.mean([repeatabilities(one, rig) for one in exact], axis=0)
+    used = np.mean([(~each.outliers).sum() for one in by_images for each in one])
+    what = f"{len(found[0])} calibrations x {IMAGES} images ({used:.1f} used)"
+    rows = [
+        Row(
+            "d",
+            f"{what}: {name}, {place} (paper{PAPER_AT[k]}: {PAPER[name][k]})",
+            figures[n, k],
+            BARS[name][k],
+            limits[n, k],
+            "mm",
+        )
+        for n, name in enumerate(("CR1", "CR2"))
+        for k, place in enumerate(PLACES)
+    ]
+    flat, perfect = ([each for one in many for each in one] for many in (found, exact))
+    error, limit = errors(flat, truth, rig), errors(perfect, truth, rig)
+    many = f"{len(flat)} calibrations, worst of five points: true error"
+    rows.append(Row("d", f"{many}, median", float(np.median(error.max(1))), TRUE_MM, float(np.median(limit.max(1))), "mm"))
+    rows.append(Row("d", f"{many}, worst", float(error.max()), TRUE_MM, float(limit.max()), "mm"))
+    ratio = sum(squared_length(each, truth) for each in flat) / (8 * len(flat))
+    freedom = 8 * len(found[0])  # repeats share their images, so only sets of these count as independent
+    low, high = chi2.ppf([(1 - REGION) / 2, (1 + REGION) / 2], freedom) / freedom
+    shared = f"{len(flat)} calibrations of {len(found[0])} sets of images, {100 * REGION:.0f} % interval of {len(found[0])}"
+    honest = f"{shared}: squared error of the parameters over its expectation"
+    rows.append(Row("d", f"{honest}, at least", ratio, low, 1.0, "", at_least=True))
+    rows.append(Row("d", f"{honest}, at most", ratio, high, 1.0, ""))
+    return rows
+
+
+def with_outliers(sightings: Sightings, size: tuple[int, int], rng: np.random.Generator) -> Sightings:
+    """Sightings, some with the crossing anywhere in the image."""
+    pixels = sightings.pixels.copy()
+    wrong = rng.choice(len(pixels), round(WRONG * len(pixels)), replace=False)
+    pixels[wrong] = rng.uniform([0, 0], np.array(size) - 1, (len(wrong), 2))
+    return replace(sightings, pixels=pixels)
+
+
+def outliers(setup: Setup, frames: Frames) -> list[Row]:
+    """Row e: the same with 30 % of the crossings anywhere, over row d; the limit is that of so many fewer frames."""
+    rig, truth = setup.rig, in_water(setup)
+    clean = [[each.calibration for each in one] for one in sets(rig, frames)[0]]
+    spoilt = []
+    for repeat in range(REPEATS):
+        rng, draw = np.random.default_rng([1, repeat]), np.random.default_rng([2, repeat])
+        ones = [with_outliers(frames.found.of(block), rig.probe.image_size, draw) for block in blocks(frames)]
+        spoilt.append([calibrated(rig, one, rng).calibration for one in ones])
+    ratio = np.mean([repeatabilities(one, rig) for one in spoilt], 0) / np.mean([repeatabilities(one, rig) for one in clean], 0)
+    limit = (1 - WRONG) ** -0.5
+    what = f"{100 * WRONG:.0f} % outliers, over those without"
+    rows = [
+        Row("e", f"{what}: {name}, {place}", ratio[n, k], 1.5, limit, "")
+        for n, name in enumerate(("CR1", "CR2"))
+        for k, place in enumerate(PLACES)
+    ]
+    after, before = (errors([each for one in many for each in one], truth, rig).max(axis=1) for many in (spoilt, clean))
+    rows.append(Row("e", f"{what}: true error, median", float(np.median(after) / np.median(before)), 1.5, limit, ""))
+    rows.append(Row("e", f"{what}: true error, worst", float(after.max() / before.max()), 1.5, limit, ""))
+    return rows
+
+
+def refusals(setup: Setup, frames: Frames) -> list[Row]:
+    """Row e: motions and axes from which nothing can follow are refused, by their names."""
+    rig, rng = setup.rig, np.random.default_rng(3)
+    upper = frames.found.pixels[:, 1] < rig.probe.image_size[1] / 2
+    block = frames.found.of(blocks(frames)[0])
+
+    def turned(matrix: Array) -> Callable[[], object]:
+        poses = tracked(rig, block.poses, rng) @ matrix
+        expected = rig.probe.target_from_image.matrix()
+        return lambda: point_calibration.calibrate(replace(block, poses=poses), rig.probe.image_size, None, expected)
+
+    def shifted() -> object:
+        poses = tracked(rig, block.poses, rng)
+        poses[:, :3, 3] *= [1, 1, -1]
+        return point_calibration.calibrate(replace(block, poses=poses), rig.probe.image_size)
+
+    cases: dict[str, tuple[Callable[[], object], str]] = {
+        "a planar motion": (lambda: calibrated(rig, planar(setup), rng), "planar motion"),
+        "one depth only": (lambda: calibrated(rig, frames.found.of(upper), rng), "one depth only"),
+        "axes of the target swapped": (turned(X_AND_Y @ LEFT_HANDED), "axes are swapped"),
+        "translations of the wrong handedness": (shifted, "wrong handedness"),
+        "rotations of the wrong handedness": (turned(LEFT_HANDED), "left-handed"),
+    }
+    return [
+        Row("e", f"{what}: refused, and named", refused(make, named), 1.0, 1.0, "", at_least=True)
+        for what, (make, named) in cases.items()
+    ]
+
+
+def planar(setup: Setup) -> Sightings:
+    """Crossings in B-scans of a probe that is tilted forward and backward only."""
+    transducer = setup.scanners["water"]
+    wired = body(crosswire.build(crosswire.Config(diameter_mm=2 * WIRE_MM)))
+    _, pixels = point_calibration.motion(transducer.image_size, FEW)
+    tilts = np.linspace(20, 35, FEW) * np.where(np.arange(FEW) % 2, 1, -1)
+    turns = np.outer(tilts, [1.0, 0, 0])
+    return looked_at(wired, transducer, held(wired, transducer, turns, pixels, np.zeros(FEW))).found
+
+
+def refused(make: Callable[[], object], named: str) -> float:
+    """1 if making a calibration is refused by a message that has the name of the fault, else 0."""
+    try:
+        make()
+    except InputError as error:
+        return float(named in str(error))
+    return 0.0
+
+
+def sound(setup: Setup, frames: Frames) -> list[Row]:
+    """Row f: the error of depths in water of 22 degrees, as predicted, and after its correction by the temperature."""
+    rig, truth = setup.rig, calibration_of(setup.rig, setup.scanners["water"])
+    speed = float(sound_in_water.speed_of_sound(TEMPERATURE_C))
+    found = [each.calibration for each in sets(rig, frames)[0][0]]
+    mean = repeatability.average(found)
+    seen, sigma = sound_in_water.implied_speed(mean, truth.scale[1])
+    predicted = float(sound_in_water.shown_too_deep(DEPTH_MM, speed))
+    deep = float(sound_in_water.shown_too_deep(DEPTH_MM, seen))
+    undone = [sound_in_water.in_medium(each, speed, sound_in_water.SCANNER_SPEED) for each in found]
+    before, after = errors(found, truth, rig).max(axis=1), errors(undone, truth, rig).max(axis=1)
+    where = f"water of {TEMPERATURE_C:g} deg C, {DEPTH_MM:g} mm shown"
+    shown = f"{where}: predicted {predicted:.2f} mm too deep, {deep:.2f} found by {len(found)} calibrations; difference"
+    limit = DEPTH_MM * sigma / sound_in_water.SCANNER_SPEED
+    five = f"{len(found)} calibrations, worst of five points"
+    return [
+        Row("f", shown, abs(deep - predicted), 3 * limit, limit, "mm"),
+        Row(
+            "f",
+            f"{five}: error for tissue, as calibrated, least",
+            before.min(),
+            predicted - TRUE_MM,
+            predicted,
+            "mm",
+            at_least=True,
+        ),
+        Row("f", f"{five}: error for tissue, converted by the temperature, median", float(np.median(after)), TRUE_MM, None, "mm"),
+        Row("f", f"{five}: error for tissue, converted by the temperature, worst", after.max(), TRUE_MM, None, "mm"),
+    ]
