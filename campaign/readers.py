@@ -6,7 +6,8 @@ from pathlib import Path
 
 from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files
 from recon.capture.surface_part import read_patterns
-from recon.clips import dicom_clip, pose_tables, video_clip
+from recon.clips import pose_tables
+from recon.clips.dialects import dicom_clip, video_clip
 from recon.clips.pose_tables import Columns
 from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
     from recon.capture.board_part import read_board
     from recon.capture.calibration_files import read as read_calibration
     from recon.capture.manifest import Device
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from recon.freehand.volume_compounding import principal_grid
     from recon.freehand.volume_compounding import reconstruct as reconstruct_volume
     from recon.geometry.camera import Camera
-    from recon.model.boards import AsymmetricCircles
     from recon.model.calibration import Calibration
     from recon.model.patterns import Patterns
     from recon.model.probe import ProbeCalibration
@@ -97,7 +97,7 @@ __all__ = [
 ]
 
 PLACES = {  # of the public names: module, and name in it where that differs
-    "AsymmetricCircles": "recon.model.boards",
+    "AsymmetricCircles": "recon.board_detection.kinds.asymmetric_circles",
     "Blur": "recon.segmentation.blur_correction",
     "Calibration": "recon.model.calibration",
     "Camera": "recon.geometry.camera",

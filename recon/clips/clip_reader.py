@@ -1,34 +1,24 @@
-"""Open a clip of any kind: a folder of images, a video, or a DICOM file."""
+"""Open a clip of any dialect, a module of `dialects` each: a folder of images, a video, or a DICOM file."""
 
 from pathlib import Path
 
-from recon.capture.images import image_files, read_grey
-from recon.clips import dicom_clip, video_clip
+from recon import registry
 from recon.clips.clip import Clip
+from recon.clips.dialects import dicom_clip
 from recon.errors import InputError
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm")
+DIALECTS = "recon.clips.dialects"  # a module each
 
 
 def read(path: Path) -> Clip:
-    """Open a clip: a folder of images in natural order, a video by the ending of its name, else a DICOM file.
+    """Open a clip of the dialect that recognises it, else a DICOM file.
 
     Raises
     ------
     InputError
-        If it is missing, damaged, or of another kind.
+        If it is missing, damaged, or of another dialect, or of two.
     """
-    if path.is_dir():
-        return of_images(path)
-    if path.suffix.lower() in VIDEOS:
-        return video_clip.read(path)
-    return dicom_clip.read(path)
-
-
-def of_images(folder: Path) -> Clip:
-    """A folder of images, all of one size; it has no times."""
-    paths = image_files(folder)
-    if not paths:
-        raise InputError(f"{folder}: expected images of a clip, found none")
-    height, width = read_grey(paths[0]).shape
-    return Clip(folder.name, (width, height), len(paths), None, lambda: (read_grey(path, (width, height)) for path in paths))
+    known = {name: dialect for name, dialect in registry.kinds(DIALECTS).items() if dialect.recognises(path)}
+    if len(known) > 1:
+        raise InputError(f"{path}: expected a clip of one dialect, found {' and '.join(known)}")
+    return next(iter(known.values()), dicom_clip).read(path)

@@ -23,8 +23,9 @@ from typing import Literal
 
 from rich.console import Console
 
-from recon.capture import board_part, calibration_files, manifest, meza2021
+from recon.capture import board_part, calibration_files, manifest
 from recon.capture.board_part import BoardCapture
+from recon.capture.layouts import meza2021
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from recon.acquisition.guidance import Operator
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError
-from recon.model.boards import AsymmetricCircles, Board
+from recon.model.boards import Board
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from scenes.kinds import board

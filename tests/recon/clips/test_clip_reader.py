@@ -8,7 +8,8 @@ import pydicom
 import pytest
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1, JPEGLSLossless
 
-from recon.clips import clip_reader, dicom_clip, image_region, video_clip
+from recon.clips import clip_reader, image_region
+from recon.clips.dialects import dicom_clip, video_clip
 from recon.errors import InputError
 from recon.files import video_file
 from tests.recon.clips import made_clips

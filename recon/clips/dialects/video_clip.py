@@ -13,7 +13,13 @@ from recon.errors import InputError
 from recon.files import video_file
 from recon.files.regular import check_there
 
+ENDS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm")
 LEAST_STEP_S = 1e-6  # between frames' time stamps; without them all are 0
+
+
+def recognises(path: Path) -> bool:
+    """Whether its name ends as a video's."""
+    return not path.is_dir() and path.suffix.lower() in ENDS
 
 
 def read(path: Path) -> Clip:

@@ -45,6 +45,14 @@ DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or comp
 )
 
 
+def recognises(path: Path) -> bool:
+    """Whether it bears DICOM's mark, which some old ones lack."""
+    if not path.is_file():
+        return False
+    with opened(path, MOST_BYTES) as stream:
+        return stream.read(PREAMBLE + len(PREFIX))[PREAMBLE:] == PREFIX
+
+
 def read(path: Path) -> Clip:
     """Open a DICOM file of one frame or more, grey or in colour.
 
