@@ -6,7 +6,8 @@ from pathlib import Path
 
 from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files
 from recon.capture.surface_part import read_patterns
-from recon.clips import clip_reader, dicom_clip, pose_tables
+from recon.clips import pose_tables
+from recon.clips.dialects import dicom_clip, video_clip
 from recon.clips.pose_tables import Columns
 from recon.devices.openigtlink.igtl_stream import Splitter
 from recon.errors import InputError
@@ -84,7 +85,7 @@ READERS = {
     "plus_config": Reader(plus_config.read_config, ("plus.xml",)),
     "messages": Reader(_messages, ("small.igtl",), "file.igtl"),
     "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
-    "video": Reader(clip_reader.read_video, ("screen.avi",), "file.avi"),
+    "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),
     "patterns": Reader(read_patterns, ("patterns.yaml",), "file.yaml"),
     "metrics": Reader(metrics.read, ("skin/metrics.json",)),
     "truth": Reader(session.read_json, ("ball/truth/scene.json",)),

@@ -14,10 +14,10 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles
 from recon.model.rig import NotNegative, Part, Positive
 from scenes.noise import Seed
 

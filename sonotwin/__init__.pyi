@@ -1,5 +1,6 @@
 """The public names of sonotwin, where they stand; `__init__.py` imports each on first use from here."""
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles as AsymmetricCircles
 from recon.capture.board_part import read_board as read_board
 from recon.capture.calibration_files import read as read_calibration
 from recon.capture.manifest import Device as Device
@@ -13,7 +14,6 @@ from recon.freehand.hole_filling import fill_holes as fill_holes
 from recon.freehand.volume_compounding import principal_grid as principal_grid
 from recon.freehand.volume_compounding import reconstruct as reconstruct_volume
 from recon.geometry.camera import Camera as Camera
-from recon.model.boards import AsymmetricCircles as AsymmetricCircles
 from recon.model.calibration import Calibration as Calibration
 from recon.model.patterns import Patterns as Patterns
 from recon.model.probe import ProbeCalibration as ProbeCalibration

@@ -7,7 +7,7 @@ from recon.board_detection import discs, lattice
 from recon.board_detection.findings import BoardNotFound, Detection, first_faults, refuse_bad, spread
 from recon.board_detection.reduced_images import reduced
 from recon.geometry.ellipses import Ellipses
-from recon.model.boards import AsymmetricCircles, Circles
+from recon.model.boards import Discs
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ MOST_RESIDUAL = (0.03, 0.3)  # of the radius and px, RMS of the edge points abou
 LEAST_RATIO = 0.3  # of the semi-axes
 
 
-def find_circles(image: Array, board: Circles, full: float) -> Detection:
+def find_circles(image: Array, board: Discs, full: float) -> Detection:
     """Find the discs of a board and measure their ellipses; see `recon.board_detection.detect.detect`."""
     image = full - image if board.white else image
     looked = reduced(image)
@@ -44,14 +44,10 @@ def find_circles(image: Array, board: Circles, full: float) -> Detection:
     )
 
 
-def _likely(centres: Array, board: Circles) -> str:
+def _likely(centres: Array, board: Discs) -> str:
     """The design that centres : (k, 2) px fit better, in words: rows and columns exchanged; nothing if they don't."""
     exchanged = board.model_copy(update={"columns": board.rows, "rows": board.columns})
-    if (
-        board.columns == board.rows
-        or not isinstance(board, AsymmetricCircles)
-        or len(centres) > MOST_PLACES * len(board.points())
-    ):
+    if board.columns == board.rows or board.pitch_mm == board.spacing_mm or len(centres) > MOST_PLACES * len(board.points()):
         return ""
     try:
         lattice.assign(centres, *_grid(exchanged))
@@ -60,17 +56,15 @@ def _likely(centres: Array, board: Circles) -> str:
     return f"; rows and columns exchanged? They fit columns: {exchanged.columns}, rows: {exchanged.rows}"
 
 
-def _grid(board: Circles) -> tuple[lattice.Integers, lattice.Integers]:
+def _grid(board: Discs) -> tuple[lattice.Integers, lattice.Integers]:
     """Cells of the discs, and two steps between neighbours."""
     cells = np.rint(board.points()[:, :2] / board.spacing_mm).astype(np.int64)
-    diagonal = isinstance(board, AsymmetricCircles)
-    return cells, np.array([[1, 1], [-1, 1]] if diagonal else [[1, 0], [0, 1]], dtype=np.int64)
+    return cells, np.array(board.NEIGHBOURS, dtype=np.int64)
 
 
-def _room(rough: Ellipses, board: Circles) -> Array:
+def _room(rough: Ellipses, board: Discs) -> Array:
     """Width of the clear band about each rim : (n,) px, from the design and the disc's own size."""
-    pitch = board.spacing_mm * (np.sqrt(2) if isinstance(board, AsymmetricCircles) else 1)
-    gap = 2 * max(pitch / board.diameter_mm - 1, 0.1)  # in radii
+    gap = 2 * max(board.pitch_mm / board.diameter_mm - 1, 0.1)  # in radii
     return np.maximum(ROOM * min(gap, 1) * rough.semi_axes[:, 1], 2.0)
 
 

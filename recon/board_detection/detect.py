@@ -15,10 +15,8 @@ odd number makes the grid its own mirror image, as symmetric grids and most ches
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.board_detection.checkerboard import find_aprilgrid, find_charuco, find_chessboard
-from recon.board_detection.circle_grid import find_circles
 from recon.board_detection.findings import BoardNotFound, Detection
-from recon.model.boards import AprilGrid, Board, Charuco, Chessboard
+from recon.model.boards import Board
 
 __all__ = ["BoardNotFound", "Detection", "detect"]
 
@@ -42,11 +40,4 @@ def detect(image: NDArray, board: Board, *, full: float = 255) -> Detection:
         quarter of the points may be unusable, as by glare on their rims; they become NaN. Of a ChArUco board, and of an
         AprilGrid, six corners are enough.
     """
-    image = np.asarray(image, np.float32)
-    if isinstance(board, Chessboard):
-        return find_chessboard(image, board, full)
-    if isinstance(board, Charuco):
-        return find_charuco(image, board, full)
-    if isinstance(board, AprilGrid):
-        return find_aprilgrid(image, board, full)
-    return find_circles(image, board, full)
+    return board.find(np.asarray(image, np.float32), full)

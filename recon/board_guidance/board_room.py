@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles, Board, Chessboard, SymmetricCircles
+from recon.model.boards import Board
 from recon.model.rig import Lens, NotNegative, Optics, Part, Positive, Rig
 
 Array = NDArray[np.float64]
@@ -113,15 +113,6 @@ def middle(board: Board) -> Array:
     """The middle of a board's points : (3,) mm, in the board's frame."""
     points = board.points()
     return (points.min(axis=0) + points.max(axis=0)) / 2
-
-
-def half_turn_is_alike(board: Board) -> bool:
-    """Whether a board looks the same after half a turn, so that a detector calls either corner the first."""
-    if isinstance(board, SymmetricCircles):
-        return True
-    if isinstance(board, AsymmetricCircles):
-        return board.rows % 2 == 0
-    return isinstance(board, Chessboard) and (board.columns + board.rows) % 2 == 0
 
 
 def fits(poses: Array, board: Board, cameras: Mapping[str, Camera], reach: Reach) -> NDArray[np.bool_]:

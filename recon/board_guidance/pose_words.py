@@ -7,7 +7,7 @@ turn in the image's plane by the clock.
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon.board_guidance.board_room import Array, half_turn_is_alike, middles
+from recon.board_guidance.board_room import Array, middles
 from recon.model.boards import Board
 
 ROUND_MM, ROUND_DEG = 10, 5  # that a person can tell
@@ -18,7 +18,7 @@ def placed(pose: Array, board: Board) -> str:
     x, y, z = middles(pose[None], board)[0]
     sides = [_amount(abs(x), "mm", "right" if x > 0 else "left"), _amount(abs(y), "mm", "down" if y > 0 else "up")]
     aside = " and ".join(filter(None, sides)) or "in the middle"
-    turned = _turned(angles(pose)[2], "upside down" if not half_turn_is_alike(board) else "")
+    turned = _turned(angles(pose)[2], "upside down" if not board.half_turn_is_alike else "")
     return ", ".join(filter(None, (f"hold it at {_rounded(z, ROUND_MM)} mm", aside, turned, *_tilts(*angles(pose)[:2]))))
 
 
@@ -41,7 +41,7 @@ def moves(asked: Array, held: Array, board: Board) -> str:
 
 def there(asked: Array, held: Array, board: Board) -> bool:
     """Whether a pose that is held is near enough to the one asked for."""
-    turn = Rotation.from_rotvec(np.deg2rad([0, 0, 180]) * half_turn_is_alike(board)).as_matrix()
+    turn = Rotation.from_rotvec(np.deg2rad([0, 0, 180]) * board.half_turn_is_alike).as_matrix()
     apart = min(Rotation.from_matrix(asked[:3, :3].T @ held[:3, :3] @ again).magnitude() for again in (np.eye(3), turn))
     there_mm, there_deg = 15.0, 8.0  # from the asked pose: near enough; nobody holds a board better
     return bool(np.linalg.norm(_shift(asked, held, board)) <= there_mm and np.rad2deg(apart) <= there_deg)
@@ -64,7 +64,7 @@ def _shift(asked: Array, held: Array, board: Board) -> Array:
 
 def _turns(asked: Array, held: Array, board: Board) -> Array:
     """Change of the tilts and of the turn : (3,) deg, the turn the shorter way round."""
-    change, circle = angles(asked) - angles(held), 180.0 if half_turn_is_alike(board) else 360.0
+    change, circle = angles(asked) - angles(held), 180.0 if board.half_turn_is_alike else 360.0
     change[2] = (change[2] + circle / 2) % circle - circle / 2
     return change
 

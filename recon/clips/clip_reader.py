@@ -1,83 +1,24 @@
-"""Open a clip of any kind: a folder of images, a video by OpenCV, or a DICOM file."""
+"""Open a clip of any dialect, a module of `dialects` each: a folder of images, a video, or a DICOM file."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from recon.capture.image_formats import MOST_PX
-from recon.capture.images import image_files, read_grey
-from recon.clips import dicom_clip
-from recon.clips.clip import Clip, checked_seconds
+from recon import registry
+from recon.clips.clip import Clip
+from recon.clips.dialects import dicom_clip
 from recon.errors import InputError
-from recon.files import video_file
-from recon.files.regular import check_there
+
+DIALECTS = "recon.clips.dialects"  # a module each
 
 
 def read(path: Path) -> Clip:
-    """Open a clip: a folder of images in natural order, a video by the ending of its name, else a DICOM file.
+    """Open a clip of the dialect that recognises it, else a DICOM file.
 
     Raises
     ------
     InputError
-        If it is missing, damaged, or of another kind.
+        If it is missing, damaged, or of another dialect, or of two.
     """
-    if path.is_dir():
-        return _of_images(path)
-    videos = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".wmv", ".webm")
-    if path.suffix.lower() in videos:
-        return read_video(path)
-    return dicom_clip.read(path)
-
-
-def _of_images(folder: Path) -> Clip:
-    """A folder of images, all of one size; it has no times."""
-    paths = image_files(folder)
-    if not paths:
-        raise InputError(f"{folder}: expected images of a clip, found none")
-    height, width = read_grey(paths[0]).shape
-    return Clip(folder.name, (width, height), len(paths), None, lambda: (read_grey(path, (width, height)) for path in paths))
-
-
-def read_video(path: Path) -> Clip:
-    """Open a video; its time stamps are those of its frames, or even by its rate where it has none.
-
-    Raises
-    ------
-    InputError
-        If it is missing or damaged.
-    """
-    check_there([path])
-    frames = [(stamp, image.shape[1::-1], rate) for stamp, image, rate in _frames(path)]
-    if not frames:
-        raise InputError(f"{path}: expected a video, found none that OpenCV can read")
-    stamps, sizes, rates = zip(*frames, strict=True)
-    seconds, rate = np.array(stamps), rates[0]
-    least_step_s = 1e-6  # between frames' time stamps; without them all are 0
-    if len(seconds) > 1 and np.diff(seconds).min() < least_step_s:
-        seconds = np.arange(len(seconds)) / rate if rate > 0 else None
-    timed = None if seconds is None else checked_seconds(path, seconds)
-    return Clip(path.name, sizes[0], len(frames), timed, lambda: _images(path))
-
-
-def _images(path: Path) -> Iterator[NDArray[np.uint8]]:
-    return (cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for _, image, _ in _frames(path))
-
-
-def _frames(path: Path) -> Iterator[tuple[float, NDArray[np.uint8], float]]:
-    """Time stamp in s, image : (h, w, 3) and the video's rate in frames/s, of each frame."""
-    video = video_file.opened(path)
-    try:
-        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
-        if not width * height <= MOST_PX:
-            raise InputError(f"{path}: expected a video of up to {MOST_PX} px, found {width:g}x{height:g}")
-        rate = float(video.get(cv2.CAP_PROP_FPS))
-        while True:
-            good, image = video.read()
-            if not good:
-                return
-            yield float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1e3, np.asarray(image, np.uint8), rate  # of the frame just read
-    finally:
-        video.release()
+    known = {name: dialect for name, dialect in registry.kinds(DIALECTS).items() if dialect.recognises(path)}
+    if len(known) > 1:
+        raise InputError(f"{path}: expected a clip of one dialect, found {' and '.join(known)}")
+    return next(iter(known.values()), dicom_clip).read(path)

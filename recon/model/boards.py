@@ -3,169 +3,104 @@
 Board frame: x to the right, y down, z away from the viewer, origin at the first point. Points come in OpenCV's order, row by row.
 """
 
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from recon.model.lengths import BOARD_STEP
-from recon.model.rig import Part, Positive
+from recon.model.part import Kinds, Positive
 
 Array = NDArray[np.float64]
 Few = Annotated[int, Field(ge=2, le=100)]
-TAGS = 587  # of AprilTag's family 36h11
 
 
-class Printed(Part):
-    """A board, by the distance of its points."""
+class Shapes(NamedTuple):
+    """What is printed in black, in the board's frame, mm; in white on black if the board says so."""
+
+    discs: Array  # (n, 3) x, y, radius
+    boxes: Array  # (m, 4) left, top, width, height
+
+
+class Board(Kinds):
+    """A calibration board, by the distance of its points; its kinds are modules of `recon.board_detection.kinds`."""
+
+    PACKAGE = "recon.board_detection.kinds"
+    STEP: ClassVar[str]  # name of the field of the distance from point to point
+    SAID: ClassVar[tuple[str, ...]] = ()  # fields that its caption has, also if they are as usual
+
+    if TYPE_CHECKING:  # fields and functions of each kind
+        columns: int
+        rows: int
+
+        @property
+        def rim_mm(self) -> float:
+            """Breadth of what is printed beyond the outermost points."""
+
+        @property
+        def half_turn_is_alike(self) -> bool:
+            """Whether it looks the same after half a turn."""
+
+        def points(self) -> Array:
+            """Its points : (n, 3) mm."""
+
+        def shapes(self) -> Shapes:
+            """What is printed."""
+
+        def find(self, image: NDArray[np.float32], full: float) -> Any:
+            """Its points in an image, as of `recon.board_detection.detect.detect`."""
 
     unusual: bool = False  # a distance of points that no usual board has, such as below 0.5 mm, is meant
 
     @model_validator(mode="after")
     def _usual_step(self) -> Self:
-        name = next(name for name in ("spacing_mm", "square_mm", "tag_mm") if name in type(self).model_fields)
-        fault = BOARD_STEP.fault(getattr(self, name))
+        fault = BOARD_STEP.fault(self.step_mm)
         if fault and not self.unusual:
-            raise ValueError(f"{name}: expected {BOARD_STEP}, found {fault} If it is right, give unusual=true with it")
+            raise ValueError(f"{self.STEP}: expected {BOARD_STEP}, found {fault} If it is right, give unusual=true with it")
         return self
 
-
-class AsymmetricCircles(Printed):
-    """Discs in rows that stand half a step off each other."""
-
-    kind: Literal["asymmetric_circles"] = "asymmetric_circles"
-    columns: Few  # circles a row
-    rows: Few
-    spacing_mm: Positive  # between rows; circles of a row stand two spacings apart
-    diameter_mm: Positive
-    white: bool = False  # discs on a dark board, as metrology's are; else dark ones on a bright board
-
-    def points(self) -> Array:
-        """Centres of the discs : (columns * rows, 3) mm."""
-        row, column = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        return np.column_stack([2 * column + row % 2, row, np.zeros(row.size)]) * self.spacing_mm
+    @property
+    def step_mm(self) -> float:
+        """Distance from point to point, as its field has it."""
+        return getattr(self, self.STEP)
 
     @property
-    def rim_mm(self) -> float:
-        """Breadth of what is printed beyond the outermost points."""
-        return self.diameter_mm / 2
+    def clear_mm(self) -> float:
+        """Step of the pattern, of which a share is to be left clear around it."""
+        return self.step_mm
 
 
-class SymmetricCircles(Printed):
-    """Discs in a square grid. Half a turn maps it onto itself; the turn of each pose follows from the errors of the print."""
+class Discs(Board):
+    """A board of discs, in rows."""
 
-    kind: Literal["symmetric_circles"] = "symmetric_circles"
-    columns: Few
+    STEP = "spacing_mm"
+    NEIGHBOURS: ClassVar[tuple[tuple[int, int], tuple[int, int]]]  # steps, in spacings, to two of a disc's neighbours
+
+    kind: str
+    columns: Few  # circles a row
     rows: Few
     spacing_mm: Positive
     diameter_mm: Positive
-    white: bool = False  # as above
-
-    def points(self) -> Array:
-        """Centres of the discs : (columns * rows, 3) mm."""
-        return _grid(self.columns, self.rows, self.spacing_mm)
+    white: bool = False  # discs on a dark board, as metrology's are; else dark ones on a bright board
 
     @property
     def rim_mm(self) -> float:
         """Breadth of what is printed beyond the outermost points."""
         return self.diameter_mm / 2
 
-
-class Chessboard(Printed):
-    """Black and white squares."""
-
-    kind: Literal["chessboard"] = "chessboard"
-    columns: Few  # inner corners a row: one less than squares
-    rows: Few
-    square_mm: Positive
-
-    def points(self) -> Array:
-        """Inner corners : (columns * rows, 3) mm."""
-        return _grid(self.columns, self.rows, self.square_mm)
-
     @property
-    def rim_mm(self) -> float:
-        """Breadth of what is printed beyond the outermost points."""
-        return self.square_mm
+    def pitch_mm(self) -> float:
+        """Distance of a disc from the nearest."""
+        return self.spacing_mm * float(np.hypot(*self.NEIGHBOURS[0]))
+
+    def shapes(self) -> Shapes:
+        """What is printed."""
+        centres = self.points()[:, :2]
+        return Shapes(np.column_stack([centres, np.full(len(centres), self.diameter_mm / 2)]), np.zeros((0, 4)))
 
 
-class Charuco(Printed):
-    """A chessboard with ArUco markers in its white squares: each corner is known by itself, so a part of the board is enough."""
-
-    kind: Literal["charuco"] = "charuco"
-    columns: Annotated[int, Field(ge=3, le=100)]  # squares a row, as OpenCV counts them here
-    rows: Annotated[int, Field(ge=3, le=100)]
-    square_mm: Positive
-    marker_mm: Positive
-    dictionary: Annotated[str, Field(pattern="^DICT_")] = "DICT_5X5_100"  # OpenCV's name
-    legacy: bool = False  # whether a marker stands in the first square, as OpenCV drew boards before 4.6
-
-    @model_validator(mode="after")
-    def _marker_fits(self) -> "Charuco":
-        if self.marker_mm >= self.square_mm:
-            raise ValueError(f"marker_mm: expected less than square_mm = {self.square_mm:g}, found {self.marker_mm:g}")
-        return self
-
-    def points(self) -> Array:
-        """Inner corners : ((columns - 1) * (rows - 1), 3) mm, relative to the first."""
-        return _grid(self.columns - 1, self.rows - 1, self.square_mm)
-
-    @property
-    def rim_mm(self) -> float:
-        """Breadth of what is printed beyond the outermost points."""
-        return self.square_mm
-
-
-class AprilGrid(Printed):
-    """Kalibr's grid of AprilTags 36h11, black squares between their corners: each corner is known by itself, as of `Charuco`.
-
-    Tags are numbered row by row from the lower left one, 0, as Kalibr prints them.
-    """
-
-    kind: Literal["aprilgrid"] = "aprilgrid"
-    columns: Annotated[int, Field(ge=1, le=100)]  # tags a row: Kalibr's tagCols
-    rows: Annotated[int, Field(ge=1, le=100)]  # tagRows
-    tag_mm: Positive  # side of a tag, its black border included: tagSize
-    spacing_ratio: Annotated[float, Field(gt=0, le=1)] = 0.3  # gap between two tags over tag_mm: tagSpacing
-    border_cells: Annotated[int, Field(ge=1, le=2)] = 2  # breadth of a tag's black border; Kalibr's is 2, AprilTag's own 1
-
-    @model_validator(mode="after")
-    def _few_enough(self) -> "AprilGrid":
-        if self.columns * self.rows > TAGS:
-            raise ValueError(f"rows: expected {TAGS} tags in all at most, as 36h11 has, found {self.columns} x {self.rows}")
-        return self
-
-    @property
-    def rim_mm(self) -> float:
-        """Breadth of what is printed beyond the outermost points: a gap, with its black squares."""
-        return self.spacing_ratio * self.tag_mm
-
-    def points(self) -> Array:
-        """Corners of the tags : (4 * columns * rows, 3) mm, row by row, two of each tag in a row."""
-        along, down = (_ends(count, self.tag_mm, self.spacing_ratio) for count in (self.columns, self.rows))
-        y, x = np.meshgrid(down, along, indexing="ij")
-        return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-
-    def corners_of_tags(self) -> NDArray[np.intp]:
-        """Which points are each tag's corners : (columns * rows, 4), from its upper left one clockwise, by the tags' numbers."""
-        tag = np.arange(self.columns * self.rows)
-        row, column = self.rows - 1 - tag // self.columns, tag % self.columns
-        first = 4 * row * self.columns + 2 * column
-        return first[:, None] + np.array([0, 1, 2 * self.columns + 1, 2 * self.columns])
-
-
-BOARDS = (AsymmetricCircles, SymmetricCircles, Chessboard, Charuco, AprilGrid)
-Circles = AsymmetricCircles | SymmetricCircles
-Squares = Chessboard | Charuco | AprilGrid
-Board = Annotated[AsymmetricCircles | SymmetricCircles | Chessboard | Charuco | AprilGrid, Field(discriminator="kind")]
-
-
-def _grid(columns: int, rows: int, step: float) -> Array:
+def grid(columns: int, rows: int, step: float) -> Array:
+    """Points of a square grid : (columns * rows, 3) mm, row by row."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     return np.column_stack([column, row, np.zeros(row.size)]) * step
-
-
-def _ends(count: int, side: float, ratio: float) -> Array:
-    """Both ends of sides in a row with gaps between them : (2 * count,)."""
-    return (np.arange(count)[:, None] * side * (1 + ratio) + np.array([0, side])).ravel()

@@ -2,18 +2,20 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
-from typing import Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    GetCoreSchemaHandler,
     ModelWrapValidatorHandler,
     ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
 )
+from pydantic_core import CoreSchema, core_schema
 
 from recon import registry
 
@@ -52,12 +54,13 @@ class Kinds(Part):
     PACKAGE: ClassVar[str]
     USUAL: ClassVar[str] = ""  # where none is named; empty where one must be
 
-    kind: str
+    if TYPE_CHECKING:
+        kind: str  # a field of each kind, in the order of its own
 
     @classmethod
     def is_any(cls) -> bool:
         """Whether this is the thing, not one of its kinds."""
-        return Kinds in cls.__bases__
+        return "PACKAGE" in vars(cls)
 
     @classmethod
     def named(cls, kind: str) -> type[Self]:
@@ -68,6 +71,14 @@ class Kinds(Part):
     def models(cls) -> list[type[Self]]:
         """The kinds."""
         return [module.Kind for module in registry.kinds(cls.PACKAGE).values()]
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Write any kind with its own fields, not with those that all kinds have."""
+        schema = handler(source)
+        if cls.is_any():
+            schema["serialization"] = core_schema.simple_ser_schema("any")
+        return schema
 
     @model_validator(mode="wrap")
     @classmethod

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.geometry import board_shape, rigid
 from recon.geometry.camera_jacobian import linearise
-from recon.model.boards import AprilGrid, Board, Charuco, Chessboard
+from recon.model.boards import Board
 from recon.optical_calibration.adjustment import Adjustment, adjust, fit
 from recon.optical_calibration.bundle import Array, Estimate, Problem, linear_system
 from recon.optical_calibration.initial_estimate import alone
@@ -34,7 +34,7 @@ NEAR = 1e-6  # of a board's size: points on each other
 
 def half_turn(board: Board) -> Turn | None:
     """The number of the point : (n,) on which half a turn puts each point; None of a board that isn't mapped onto itself."""
-    if isinstance(board, Charuco | AprilGrid) or (isinstance(board, Chessboard) and (board.columns - board.rows) % 2):
+    if not board.half_turn_is_alike:
         return None
     points = board.points()
     turned = points.min(axis=0) + points.max(axis=0) - points

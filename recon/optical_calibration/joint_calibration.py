@@ -13,7 +13,7 @@ from recon.geometry import board_shape, usual_lenses
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import difference
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.boards import BOARDS, AsymmetricCircles, Board, SymmetricCircles
+from recon.model.boards import Board, Discs
 from recon.model.calibration import Calibration
 from recon.model.rig import NotNegative, Part
 from recon.optical_calibration import half_turns, initial_estimate
@@ -130,7 +130,7 @@ def calibrate(
 def _check(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings | None, name: str) -> None:
     """Refuse what `calibrate` can't take, and points outside of their device's image."""
     arguments.of_kind(f"{name}: sightings", sightings, Sequence)
-    arguments.of_kind(f"{name}: board", board, *BOARDS)
+    arguments.of_kind(f"{name}: board", board, Board)
     arguments.of_kind(f"{name}: sizes", sizes, Mapping, way="width and height of each device: {'cam1': (1280, 1024)}")
     arguments.of_kind(f"{name}: settings", settings, Settings, type(None))
     extents = {device: np.array(arguments.image_size(f"{name}: sizes: {device}", size)) for device, size in sizes.items()}
@@ -236,7 +236,7 @@ def circle_offsets(observations: Observations, estimate: Estimate, board: Board)
     The projector's coordinates were read at the ellipses' centres in camera 1, so they are off by as much, carried over.
     """
     offsets = np.zeros_like(observations.pixels)
-    if not isinstance(board, AsymmetricCircles | SymmetricCircles):
+    if not isinstance(board, Discs):
         return offsets
     for d, device in enumerate(observations.devices):
         if device != PROJECTOR:

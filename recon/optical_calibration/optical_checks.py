@@ -11,7 +11,7 @@ from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.geometry.lens_domain import is_one_to_one
 from recon.model import lengths
-from recon.model.boards import AsymmetricCircles, Board, SymmetricCircles
+from recon.model.boards import Board, Discs
 from recon.model.calibration import WORLD
 from recon.optical_calibration.adjustment import Adjustment
 from recon.optical_calibration.bundle import Array, Estimate
@@ -98,7 +98,7 @@ def refuse_wrong_size(board: Board, radii: Sequence[Mapping[str, Array]], start:
     InputError
         If they differ by more than any printer's ink spreads.
     """
-    if not isinstance(board, AsymmetricCircles | SymmetricCircles):
+    if not isinstance(board, Discs):
         return None
     ratios = []
     for pose, found in zip(start.poses, radii, strict=True):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon import arguments
 from recon.board_detection.detect import BoardNotFound, Detection, detect
 from recon.errors import InputError
-from recon.model.boards import BOARDS, Board
+from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.optical_calibration.observations import PROJECTOR, Observations, Size
 from recon.optical_calibration.projector_points import correspondences
@@ -109,7 +109,7 @@ def _check(
 ) -> None:
     """Refuse what `sight` can't take."""
     place = f"find_board: {name}"
-    arguments.of_kind(f"{place}: board", board, *BOARDS)
+    arguments.of_kind(f"{place}: board", board, Board)
     for argument, value in (("lit", lit), ("bits", bits)):
         arguments.of_kind(f"{place}: {argument}", value, Mapping, way="one entry a camera: {'cam1': ...}")
     arguments.of_kind(f"{place}: patterns", patterns, Patterns, type(None), way="sonotwin.read_patterns reads them")

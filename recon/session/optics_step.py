@@ -7,8 +7,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
-from recon.capture import board_part, calibration_files, manifest, meza2021
+from recon.capture import board_part, calibration_files, manifest
 from recon.capture.board_part import BoardCapture
+from recon.capture.layouts import meza2021
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import Delaunay
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.geometry import rigid
-from recon.model.boards import AsymmetricCircles
 from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.noise import Seed

@@ -28,7 +28,6 @@ from recon import registry
 from recon.capture import (
     calibration_files,
     manifest,
-    meza2021,
     meza2021_sweep,
     probe_files,
     stereo_frames,
@@ -36,6 +35,7 @@ from recon.capture import (
     sweep_part,
 )
 from recon.capture.images import read_image
+from recon.capture.layouts import meza2021
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.capture.stereo_frames import Film
 from recon.capture.sweep_part import SweepCapture

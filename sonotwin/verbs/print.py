@@ -20,9 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from recon.artwork import board_drawing, paper_sheet, target_drawing
 from recon.artwork.paper_sheet import PAPERS, Card, Sheet, Size
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError
 from recon.files import atomic
-from recon.model.boards import AsymmetricCircles, Board
+from recon.model.boards import Board, Discs
 from recon.model.rig import Rig, Target
 from recon.registry import Choice
 from sonotwin.verbs.describe import design
@@ -103,10 +104,9 @@ def draw_target(config: Config, target: Target) -> None:
 
 def check_discs(board: Board) -> None:
     """Refuse discs that touch each other."""
-    diameter = getattr(board, "diameter_mm", 0.0)
-    apart = getattr(board, "spacing_mm", 1.0) * (2**0.5 if isinstance(board, AsymmetricCircles) else 1)
-    if diameter >= apart:
-        raise InputError(f"board.diameter_mm: expected less than the {apart:.2f} mm between centres, found {diameter:g}")
+    if isinstance(board, Discs) and board.diameter_mm >= board.pitch_mm:
+        expected = f"expected less than the {board.pitch_mm:.2f} mm between centres"
+        raise InputError(f"board.diameter_mm: {expected}, found {board.diameter_mm:g}")
 
 
 def placed(config: Config, card: Card, advice: str) -> Sheet:

@@ -37,13 +37,14 @@ from recon.acquisition.surface_recording import SurfacePlan, record_surface
 from recon.acquisition.sweep_recording import SweepPlan, record_sweep
 from recon.acquisition.target_checks import target_judge
 from recon.artwork import projected_images
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.board_guidance.board_room import PoseLimits
 from recon.capture.board_part import FRINGE_CAMERA
 from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
 from recon.devices.interfaces import Trigger
 from recon.devices.pattern_player import Pattern, Stage, Streamed, Taking, Triggered
 from recon.errors import InputError, validated
-from recon.model.boards import AsymmetricCircles, Board
+from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.registry import Choice

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.geometry import rigid
 from recon.geometry.camera_jacobian import linearise
-from recon.model.boards import AsymmetricCircles
 from recon.optical_calibration.bundle import Estimate
 from recon.optical_calibration.joint_calibration import circle_offsets
 from recon.optical_calibration.observations import Observations

@@ -3,8 +3,11 @@
 import cv2
 import numpy as np
 
+from recon.board_detection.kinds.aprilgrid import AprilGrid
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from recon.geometry import rigid
-from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, SymmetricCircles
+from recon.model.boards import Discs
 from tests.recon import plane_views
 
 SUB = 4  # sub-pixels a pixel and axis
@@ -23,7 +26,7 @@ def pose(board, distance, tilt=(0.0, 0.0), turn=0.0, centre=(0.0, 0.0)):
 
 def shares(board, xy, footprint):
     """How white the board is about (..., 2) mm: 1 on the ground, 0 on a disc or a black square, between them across a rim."""
-    if isinstance(board, AsymmetricCircles | SymmetricCircles):
+    if isinstance(board, Discs):
         return np.clip((_to_nearest(board, xy) - board.diameter_mm / 2) / footprint + 0.5, 0, 1)
     if isinstance(board, Charuco):
         return _of_charuco(board, xy)

@@ -1,8 +1,8 @@
 """Captures of one part, written in one call."""
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.capture.manifest import CAMERAS, SCANNER, Device
 from recon.capture.writer import new_capture
-from recon.model.boards import AsymmetricCircles
 from recon.model.patterns import Fringes, GrayCode, Patterns
 
 PROJECTOR = (128, 80)

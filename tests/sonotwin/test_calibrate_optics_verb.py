@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import sonotwin
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.capture import calibration_files
 from recon.capture.manifest import BoardPart, Device
 from recon.capture.writer import new_capture, write_pose
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from sonotwin.cli import main

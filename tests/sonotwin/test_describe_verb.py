@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.capture import board_part, calibration_files, surface_part
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
 from recon.model.calibration import Calibration
 from sonotwin.cli import main
 from tests.recon import board_views
@@ -255,7 +255,7 @@ def test_wrong_images_and_fields_are_refused(poses, capsys):
     (poses / "images/10/3.png").write_text("text")
     assert refusal(capsys, *fields).startswith("images/10/3.png: expected an image")
     assert refusal(capsys).startswith("describe: expected board, patterns or both")
-    assert "board.kind: expected one of 'asymmetric_circles'" in refusal(
+    assert "board.kind: expected one of 'aprilgrid', 'asymmetric_circles'" in refusal(
         capsys, "board={kind: checkerboard, columns: 9, rows: 6}"
     )
     assert refusal(capsys, "board={kind: chessboard, columns: 9, rows: 6}") == "board.square_mm: expected a value, found none"

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from recon.capture import calibration_files, meza2021, stereo_frames, surface_part, sweep_part, sweep_tables
+from recon.capture import calibration_files, stereo_frames, surface_part, sweep_part, sweep_tables
+from recon.capture.layouts import meza2021
 from recon.capture.manifest import CAMERAS, SCANNER, Device, read_manifest
 from recon.capture.writer import new_capture
 from recon.geometry import rigid

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.capture import manifest
 from recon.capture.images import read_image
 from recon.capture.manifest import CAMERAS, SCANNER, SCHEMA, BoardPart, Device, Manifest, SweepPart, is_sweep
@@ -16,7 +17,6 @@ from recon.errors import InputError
 from recon.files import written_files
 from recon.files.npz import Form
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles
 from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, Patterns
 from scenes.scene_types import Scene, Sphere

@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from recon.acquisition.guidance import Answer, Operator, Step
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model.boards import AsymmetricCircles, Board
+from recon.model.boards import Board
 from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from scenes.kinds import board

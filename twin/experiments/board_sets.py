@@ -10,7 +10,7 @@ import numpy as np
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import linearise
-from recon.model.boards import AsymmetricCircles, Board, Circles, SymmetricCircles
+from recon.model.boards import Board, Discs
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 from recon.optical_calibration.board_frames import MOST_AT_ONCE
@@ -122,7 +122,7 @@ def drawn(
             {
                 name: disc_radii(camera, pose, design)
                 for name, camera in truth.cameras.items()
-                if name in CAMERAS and isinstance(design, AsymmetricCircles | SymmetricCircles)
+                if name in CAMERAS and isinstance(design, Discs)
             },
         )
         for p, pose in enumerate(poses)
@@ -173,7 +173,7 @@ def on_board(camera: Camera, pose: Array, world: Array) -> Array:
     return linearise(camera, world, ()).by_point @ pose[:3, :2]
 
 
-def disc_radii(camera: Camera, pose: Array, design: Circles) -> Array:
+def disc_radii(camera: Camera, pose: Array, design: Discs) -> Array:
     """Semi-axes of the discs' images, both the radius of a circle of the same area : (n, 2) px."""
     magnified = np.abs(np.linalg.det(on_board(camera, pose, rigid.apply(pose, design.points()))))
     return np.repeat(design.diameter_mm / 2 * np.sqrt(magnified)[:, None], 2, axis=1)

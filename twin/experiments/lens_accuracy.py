@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.geometry.lens_domain import is_one_to_one
 from recon.geometry.usual_lenses import corner_radius
-from recon.model.boards import AsymmetricCircles
 from recon.model.calibration import Calibration
 from recon.optical_calibration import uncertainty
 from recon.optical_calibration.distortion_selection import ModelName

@@ -8,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import AsymmetricCircles, Board, Chessboard, SymmetricCircles
+from recon.model.boards import Board
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
 from recon.optical_calibration import uncertainty

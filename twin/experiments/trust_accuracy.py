@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from recon.artwork import board_drawing, paper_sheet, projected_images, target_drawing
 from recon.artwork.paper_sheet import Card
 from recon.board_detection.detect import detect
-from recon.model.boards import AsymmetricCircles, Board, Charuco, Chessboard, Squares, SymmetricCircles
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
+from recon.model.boards import Board, Discs
 from recon.model.circle_layout import circle_centres
 from recon.structured_light.decode import decode
 from recon.tracking import networks, photographs
@@ -56,7 +60,7 @@ def printed_board(name: str, board: Board) -> list[Row]:
     image, pixel = raster(board_drawing.card_of(board))
     found = detect(image, board)
     rows = [Row("f", f"{name}, printed at {DPI} dpi: points off", misfit(found.pixels * pixel, board.points()), 0.02, None, "mm")]
-    if found.radii is not None and not isinstance(board, Squares):
+    if found.radii is not None and isinstance(board, Discs):
         worst = float(np.abs(2 * found.radii * pixel.mean() - board.diameter_mm).max())
         rows.append(Row("f", f"{name}, printed at {DPI} dpi: diameters off", worst, 0.02, None, "mm"))
     return rows

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from recon.acquisition import recording
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.capture import sweep_tables
 from recon.capture.board_part import read_board
 from recon.capture.images import read_image
 from recon.capture.manifest import Device, read_manifest
 from recon.errors import InputError
-from recon.model.boards import AsymmetricCircles
 from recon.model.patterns import Fringes, GrayCode, Patterns
 
 SIZE = (32, 24)

@@ -6,7 +6,11 @@ import pytest
 
 from recon.artwork import board_drawing, paper_sheet
 from recon.board_detection.detect import detect
-from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
+from recon.board_detection.kinds.aprilgrid import AprilGrid
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from tests.recon.artwork.rasters import raster, rigid_misfit
 
 A4 = paper_sheet.PAPERS["a4"]

@@ -5,7 +5,8 @@ import pytest
 
 from recon.artwork import board_drawing, paper_sheet
 from recon.artwork.paper_sheet import PAPERS
-from recon.model.boards import AsymmetricCircles, Chessboard
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.chessboard import Chessboard
 from tests.recon.artwork.rasters import raster
 
 MARGIN = 5.0

@@ -3,14 +3,20 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from recon.board_detection import checkerboard, reduced_images
+from recon.board_detection import reduced_images
 from recon.board_detection.detect import BoardNotFound, detect
+from recon.board_detection.kinds import aprilgrid, chessboard
+from recon.board_detection.kinds.aprilgrid import AprilGrid
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from recon.board_detection.lattice import assign
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.boards import AprilGrid, AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
+from recon.model.boards import Discs
 from tests.recon import board_views
 from tests.recon.board_views import pose, view
 
@@ -43,7 +49,7 @@ def noisy(image, rng, sigma=1.5):
 
 def truth(board, at):
     centres = CAMERA.project(rigid.apply(at, board.points()))
-    if isinstance(board, AsymmetricCircles | SymmetricCircles):
+    if isinstance(board, Discs):
         centres += centre_offsets(CAMERA, at, board.points(), board.diameter_mm / 2)
     return centres
 
@@ -136,7 +142,7 @@ def test_large_images_are_looked_at_reduced_and_measured_whole(board, clean, rng
     image = noisy(clean(board)[0], rng)
     whole = detect(image, board)
     monkeypatch.setattr(reduced_images, "LARGE_PX", 1e5)  # of 192 000
-    monkeypatch.setattr(checkerboard, "FEWEST_PX", 7e4)
+    monkeypatch.setattr(chessboard, "FEWEST_PX", 7e4)
     assert reduced_images.reduced(image).image.size <= 1e5
     np.testing.assert_allclose(detect(image, board).pixels, whole.pixels, atol=0.02)  # of 0.01 px by noise: windows differ
     at = np.array([[10.0, 20.0], [100.25, 7.5]])
@@ -157,7 +163,7 @@ def test_tags_lie_as_kalibr_prints_them():
     white = np.array([int(bit) for bit in f"{0xD5D628584:036b}"], np.uint8).reshape(6, 6)
     image = np.full((300, 300), 200, np.uint8)
     image[50:250, 50:250] = 20 + 180 * np.kron(np.pad(white, 2), np.ones((20, 20), np.uint8))
-    corners, numbers = checkerboard._tags(image, border=2)
+    corners, numbers = aprilgrid._tags(image, border=2)
     assert numbers.tolist() == [0]
     np.testing.assert_allclose(corners[0], [[50, 50], [250, 50], [250, 250], [50, 250]], atol=2)
     assert APRILGRID.points()[APRILGRID.corners_of_tags()[0, 0]] == pytest.approx([0, 28 * 1.3, 0])

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.board_guidance.pose_verdict import board_blur
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
 from tests.recon import board_views
 from tests.recon.board_guidance.held_boards import photograph
 from tests.recon.board_sets import BOARD

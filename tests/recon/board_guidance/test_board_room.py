@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from recon.board_guidance import board_room
-from recon.board_guidance.board_room import PoseLimits, candidates, fits, half_turn_is_alike, middles, outline, reach_of
+from recon.board_guidance.board_room import PoseLimits, candidates, fits, middles, outline, reach_of
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model.boards import AsymmetricCircles, Charuco, Chessboard, SymmetricCircles
 from tests.recon.board_guidance.held_boards import posed
 from tests.recon.board_sets import BOARD, devices
 
@@ -84,12 +87,12 @@ def test_the_outline_runs_around_all_points(board):
 
 
 def test_boards_that_half_a_turn_leaves_alike():
-    assert not half_turn_is_alike(BOARD)
-    assert half_turn_is_alike(BOARD.model_copy(update={"rows": 10}))
-    assert half_turn_is_alike(SymmetricCircles(columns=5, rows=4, spacing_mm=10, diameter_mm=5))
-    assert half_turn_is_alike(Chessboard(columns=7, rows=5, square_mm=10))
-    assert not half_turn_is_alike(Chessboard(columns=7, rows=6, square_mm=10))
-    assert not half_turn_is_alike(Charuco(columns=7, rows=5, square_mm=10, marker_mm=7))
+    assert not BOARD.half_turn_is_alike
+    assert BOARD.model_copy(update={"rows": 10}).half_turn_is_alike
+    assert SymmetricCircles(columns=5, rows=4, spacing_mm=10, diameter_mm=5).half_turn_is_alike
+    assert Chessboard(columns=7, rows=5, square_mm=10).half_turn_is_alike
+    assert not Chessboard(columns=7, rows=6, square_mm=10).half_turn_is_alike
+    assert not Charuco(columns=7, rows=5, square_mm=10, marker_mm=7).half_turn_is_alike
 
 
 def test_margins_keep_candidates_from_the_borders(rig, rng):

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.board_guidance.board_room import ALIKE_DEG, ALIKE_MM, apart, candidates, fits, reach_of
 from recon.board_guidance.next_pose import NOISE_PX, few, knowledge, suggest
 from recon.board_guidance.pose_information import of_rig
-from recon.model.boards import Chessboard
 from tests.recon.board_guidance.held_boards import kept, posed, spread
 from tests.recon.board_sets import BOARD, devices
 

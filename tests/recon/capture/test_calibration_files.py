@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from recon import registry
-from recon.capture import calibration_files, meza2021
+from recon.capture import calibration_files
+from recon.capture.layouts import meza2021
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera

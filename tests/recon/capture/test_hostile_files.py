@@ -184,7 +184,7 @@ def test_frames_without_number_are_refused(tmp_path):
         (lambda m: m["devices"]["cam1"].update(exposure_s=1e308), "devices.cam1.exposure_s: expected numbers of up to 1e+12"),
         (
             lambda m: m["board"]["board"].update(columns=10**6),
-            "board.board.chessboard.columns: expected less than or equal to 100",
+            "board.board.columns: expected less than or equal to 100",
         ),
         (lambda m: m["board"]["poses"][0].update(name="../../x"), "board.poses.0.name: expected a name without slashes"),
         (lambda m: m["board"]["poses"][0]["lit"].update(cam1="/etc/passwd"), "board.poses.0.lit.cam1: expected a path within"),

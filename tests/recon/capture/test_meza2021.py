@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.capture import calibration_files, meza2021
+from recon.capture import calibration_files
+from recon.capture.layouts import meza2021
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.geometry import rigid

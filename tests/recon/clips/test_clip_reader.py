@@ -8,7 +8,8 @@ import pydicom
 import pytest
 from pydicom.uid import DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1, JPEGLSLossless
 
-from recon.clips import clip_reader, dicom_clip, image_region
+from recon.clips import clip_reader, image_region
+from recon.clips.dialects import dicom_clip, video_clip
 from recon.errors import InputError
 from recon.files import video_file
 from tests.recon.clips import made_clips
@@ -193,7 +194,7 @@ def test_a_video_gives_its_frames_and_times(tmp_path):
     clip = clip_reader.read(tmp_path / "screen.avi")
     assert clip.size == SCREEN and clip.seconds == pytest.approx(np.arange(6) / 25)
     assert np.abs(np.float64(frames_of(clip)) - shown).mean() < 2
-    assert [stamp for stamp, _, _ in clip_reader._frames(tmp_path / "screen.avi")] == pytest.approx(np.arange(6) / 25), (
+    assert [stamp for stamp, _, _ in video_clip._frames(tmp_path / "screen.avi")] == pytest.approx(np.arange(6) / 25), (
         "not even by the rate"
     )
     (tmp_path / "screen.avi").rename(tmp_path / "screen.MKV")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.geometry import board_shape
 from recon.geometry.board_shape import Tolerances, departures, estimated
-from recon.model.boards import AsymmetricCircles
 
 DESIGN = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9).points()
 SIGMA_MM = 0.004  # of each coordinate, as sighted

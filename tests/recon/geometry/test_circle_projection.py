@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.circle_projection import centre_offsets
-from recon.model.boards import AsymmetricCircles
 
 MATRIX = np.array([[3320, 0, 618], [0, 3331, 523], [0, 0, 1.0]])
 BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=15, diameter_mm=9)

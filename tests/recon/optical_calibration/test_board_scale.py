@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
 from recon.optical_calibration.joint_calibration import Settings, calibrate
 from recon.optical_calibration.sightings import Sighting
 

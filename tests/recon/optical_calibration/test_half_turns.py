@@ -5,7 +5,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from recon.model.boards import AsymmetricCircles, Chessboard, SymmetricCircles
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.chessboard import Chessboard
+from recon.board_detection.kinds.symmetric_circles import SymmetricCircles
 from recon.optical_calibration.half_turns import half_turn
 
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
+from recon.board_detection.kinds.charuco import Charuco
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.errors import InputError
 from recon.estimation.levenberg_marquardt import Rules
 from recon.geometry import rigid
-from recon.model.boards import AsymmetricCircles, Charuco, Chessboard
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes
 from recon.optical_calibration import adjustment, joint_calibration

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.aprilgrid import AprilGrid
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.capture.board_part import read_board
 from recon.capture.manifest import BoardPart, Device
 from recon.capture.writer import new_capture, write_pose
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import AprilGrid, Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.optical_calibration import board_frames, sightings
 from recon.optical_calibration.sightings import Cause, sight

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from recon.board_detection.kinds.chessboard import Chessboard
 from recon.capture.board_part import BoardCapture, read_board
 from recon.capture.manifest import BoardPart, Device
 from recon.capture.writer import new_capture, write_pose
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
-from recon.model.boards import Chessboard
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.pattern_trials import likely_patterns
 from tests.recon.board_views import pose, under_patterns

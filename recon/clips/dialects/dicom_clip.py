@@ -31,7 +31,9 @@ from recon.files.regular import check_there, opened
 Dataset = Any
 Result = TypeVar("Result")
 
+MOST_BYTES = 1 << 33
 MOST_UNPACKED = 1 << 30  # bytes, of a file that is packed as a whole
+PREAMBLE, PREFIX = 128, b"DICM"
 META = 2  # group of the tags before the part that may be packed
 
 LOSSLESS = (JPEGLossless, JPEGLosslessSV1)
@@ -39,6 +41,14 @@ DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or comp
     *(InvalidDicomError, BytesLengthException, AttributeError, EOFError, LookupError, OSError, OverflowError),
     *(RuntimeError, TypeError, ValueError, struct.error, zlib.error, MemoryError, NotImplementedError),
 )
+
+
+def recognises(path: Path) -> bool:
+    """Whether it bears DICOM's mark, which some old ones lack."""
+    if not path.is_file():
+        return False
+    with opened(path, MOST_BYTES) as stream:
+        return stream.read(PREAMBLE + len(PREFIX))[PREAMBLE:] == PREFIX
 
 
 def read(path: Path) -> Clip:
@@ -133,8 +143,7 @@ def _lossless(header: Dataset, count: int) -> Iterator[NDArray]:
 
 def _dataset(path: Path, stop_before_pixels: bool = False) -> Dataset:
     """Read a file; one that is packed as a whole, which may unpack to more than any memory, up to a bound."""
-    most_bytes = 1 << 33
-    with opened(path, most_bytes) as stream:
+    with opened(path, MOST_BYTES) as stream:
         return pydicom.dcmread(_plain(path, stream), stop_before_pixels=stop_before_pixels)
 
 
@@ -143,9 +152,8 @@ def _plain(path: Path, stream: BinaryIO) -> BinaryIO:
 
     Source: DICOM PS3.5, A.5: raw deflate behind the tags of group 2.
     """
-    preamble, prefix = 128, b"DICM"
-    stream.seek(preamble)
-    if stream.read(len(prefix)) == prefix:
+    stream.seek(PREAMBLE)
+    if stream.read(len(PREFIX)) == PREFIX:
         meta = read_dataset(stream, is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != META)
         if meta.get("TransferSyntaxUID") == DeflatedExplicitVRLittleEndian:
             length = stream.tell()

@@ -5,8 +5,9 @@ are left out. They may be of any kind that OpenCV reads, in colour too. Pitch 12
 to 8, projector column (width - 1) / 2 at phase zero.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,17 +15,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture import calibration_files
+from recon.capture import calibration_files, meza2021_sweep, probe_files, sweep_tables
 from recon.capture.images import Size, image_files, read_grey, write_images
+from recon.capture.layouts import Known
+from recon.capture.manifest import SCANNER, Device
+from recon.capture.meza2021_sweep import AuthorsSweep
 from recon.capture.surface_part import SurfaceCapture
+from recon.capture.writer import CaptureWriter
 from recon.errors import InputError, validated
 from recon.files import atomic, json_text
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import CentreLine, Fringes, Patterns, Uniform
-from recon.model.probe import Speed
+from recon.model.probe import ProbeCalibration, Speed
 from recon.model.rig import Part
+from recon.model.tracks import Track
 
 STEPS = 8
 PITCH = 12.0  # projector px
@@ -33,6 +39,7 @@ PARAMETERS = "cam1_proj_params.npz"
 STEREO_PARAMETERS = "cam1_cam2_params.npz"
 STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
 MARKER = "sonotwin-export.json"
+PAIRS = "pairs.csv"
 
 
 def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Patterns:
@@ -90,6 +97,102 @@ class _Mark(Part):
 
     layout: Literal["meza2021"] = "meza2021"
     speed_m_s: Speed | None = None
+
+
+def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[str]]:
+    """Read what is there of SLdata, USdata and the files of calibrations; gives what writes it and returns lines about it.
+
+    Raises
+    ------
+    InputError
+        If nothing of the layout is there, a file is damaged, or parts don't fit together.
+    """
+    fringes = read_images(folder, known.projector_size) if (folder / "SLdata").is_dir() else None
+    sweep = meza2021_sweep.read_sweep(folder)
+    if fringes is None and sweep is None:
+        raise InputError(f"{folder}: expected SLdata/images or USdata/US, as in the rig authors' data set, found neither")
+    optics, about_optics = _cameras(folder, known, None if fringes is None else fringes[0], sweep)
+    probe = _read_probe(folder, known)
+
+    def fill(capture: CaptureWriter) -> list[str]:
+        lines = list(about_optics)
+        if optics.cameras:
+            capture.add_calibration(optics)
+        if fringes is not None:
+            lines.append(_add_surface(capture, *fringes[:2]))
+        if sweep is not None:
+            lines += _add_sweep(capture, sweep, known)
+        if probe is not None:
+            calibration, source = probe
+            capture.add_probe(calibration)
+            speed = f"{calibration.speed_m_s:g} m/s{source}"
+            lines.append(f"probe       {probe_files.AUTHORS}, taken as right for sound of {speed}")
+        return lines
+
+    return fill
+
+
+def _cameras(folder: Path, known: Known, fringes: NDArray | None, sweep: AuthorsSweep | None) -> tuple[Calibration, list[str]]:
+    """All devices of both pairs in camera 1's frame, and lines about them; camera 1 is that of the pair with the projector."""
+    found, lines = {}, []
+    sizes = {} if sweep is None else {name: size for name, size in sweep.sizes.items() if name != SCANNER}
+    stereo, projector = (folder / name for name in (STEREO_PARAMETERS, PARAMETERS))
+    if stereo.exists() and {"cam1", "cam2"} <= sizes.keys():
+        found |= calibration_files.read(stereo, sizes).cameras
+    if fringes is not None and projector.exists():
+        size = {"cam1": fringes.shape[:0:-1], "projector": known.projector_size}
+        pair = dict(calibration_files.read(projector, size).cameras)
+        first = found.get("cam1")
+        if first is not None and not np.allclose(first.matrix, pair["cam1"].matrix, rtol=1e-6):
+            apart = np.abs(first.matrix - pair["cam1"].matrix).max()
+            lines.append(
+                f"optics      camera 1 differs by up to {apart:.2g} px between both pairs, which were calibrated apart; it is "
+                f"taken from {PARAMETERS}; to track, give calibration={stereo}"
+            )
+        found |= pair
+    return Calibration(found), [f"optics      {', '.join(found) or 'none'}", *lines]
+
+
+def _add_surface(capture: CaptureWriter, images: NDArray, patterns: Patterns) -> str:
+    """Write the fringe images; returns a line about them."""
+    height, width = images.shape[1:]
+    devices = {"cam1": Device(size=(width, height)), "projector": Device(size=patterns.projector_size)}
+    capture.add_surface({"cam1": images}, patterns, devices)
+    return f"surface     {len(images)} images, {width}x{height}; mask.png is left out, as a surface finds its own"
+
+
+def _add_sweep(capture: CaptureWriter, sweep: AuthorsSweep, known: Known) -> list[str]:
+    """Write B-scans, frames and poses, at even times, and pairs of poses and crossings; returns lines about them."""
+    times = np.rint(np.arange(sweep.count) * 1e9 / known.camera_hz).astype(np.int64)
+    devices = {name: Device(size=size) for name, size in sweep.sizes.items()}
+    track = None if sweep.poses is None else Track(times, sweep.poses)
+    capture.add_sweep(dict.fromkeys(devices, times), _images(sweep), devices, track, purpose=known.purpose)
+    held = ", ".join(meza2021_sweep.FOLDERS[name] for name in devices)
+    lines = [f"sweep       {sweep.count} frames of {held}, {'with' if track else 'without'} poses, {known.camera_hz:g} a second"]
+    if sweep.poses is not None and sweep.crossings is not None:
+        rows = ([*pose[:3].ravel().tolist(), *pixel.tolist()] for pose, pixel in zip(sweep.poses, sweep.crossings, strict=True))
+        sweep_tables.write_rows(capture.folder / PAIRS, sweep_tables.PAIRS, rows)
+        lines.append(f"pairs       {sweep.count} of a pose and a crossing, {PAIRS}")
+    if sweep.masks:
+        lines.append(f"left out    {len(sweep.masks)} masks of B-scans, for which captures have no place")
+    return lines
+
+
+def _read_probe(folder: Path, known: Known) -> tuple[ProbeCalibration, str] | None:
+    """The probe's calibration, and where its speed of sound is from, for a console; None without one."""
+    path = folder / probe_files.AUTHORS
+    if not path.exists():
+        return None
+    exported = None if known.speed_m_s else speed_of(folder)
+    read = probe_files.read(path, known.speed_m_s or exported)
+    source = f", as {MARKER} says" if exported else " (speed_m_s)"
+    return replace(read, speed_m_s=known.speed_m_s or read.speed_m_s), source
+
+
+def _images(sweep: AuthorsSweep) -> Iterator[tuple[str, NDArray]]:
+    for name, paths in sweep.images.items():
+        for path in paths:
+            yield name, read_grey(path, sweep.sizes[name])
 
 
 @contextmanager

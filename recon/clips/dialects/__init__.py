@@ -1,0 +1,9 @@
+"""Clips of a scanner's screen. Each module is a dialect, recognised by the name of the file or its kind.
+
+A module has
+
+- `recognises(path)`: whether it is of this dialect and of no other;
+- `read(path)`: the `recon.clips.clip.Clip`, or InputError.
+
+A file that none recognises is taken for a DICOM file.
+"""
