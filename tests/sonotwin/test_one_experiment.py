@@ -67,13 +67,14 @@ def test_one_capture_gives_one_set_of_figures(demonstrated, tmp_path):
 def texts(source: str) -> Iterator[str]:
     """Places in a module that pass settings as text: words that are read again, and lists of words made of values."""
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in READERS:
-            if any(isinstance(one, ast.Constant | ast.JoinedStr | ast.List) for one in node.args[1:2]):
-                yield f"line {node.lineno}: {ast.unparse(node)}"
+        reads = isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in READERS
+        words = node.args[1:2] if isinstance(node, ast.Call) and reads else []
+        if any(isinstance(one, ast.Constant | ast.JoinedStr | ast.List) for one in words):
+            yield f"line {node.lineno}: {ast.unparse(node)}"
         elements = node.elts if isinstance(node, ast.List | ast.Tuple) else [node.elt] if isinstance(node, ast.ListComp) else []
         for one in elements:
-            words = one.values[0] if isinstance(one, ast.JoinedStr) else one
-            if isinstance(words, ast.Constant) and isinstance(words.value, str) and is_field(words.value):
+            text = one.values[0] if isinstance(one, ast.JoinedStr) else one
+            if isinstance(text, ast.Constant) and isinstance(text.value, str) and is_field(text.value):
                 yield f"line {one.lineno}: {ast.unparse(one)}"
 
 
