@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.capture import manifest, probe_files
+from recon.capture import manifest, probe_files, sweep_part
 from recon.capture.manifest import Manifest
 from recon.files import metrics, volumes
 from recon.files.written_files import LIST
+from recon.probe_calibration import tank_calibration
+from recon.session import latency_step, probe_step
 from sonotwin.cli import main
 from tests.recon import probe_motions, sweep_sets
 from tests.recon.tracking import films
@@ -55,6 +57,17 @@ def test_wires_are_calibrated_with_the_lag_of_the_bottom(result, rig):
     corners = np.array([[0, 0], [320, 0], [0, 407], [320, 407], [160, 203]])
     assert np.linalg.norm(probe.to_target(corners) - true.to_target(corners), axis=1).max() < 0.5
     assert not any("seconds" in name for name in found)
+
+
+def test_each_step_alone_finds_the_same(result, tank, rig):
+    """As laboratories of studies call the steps: with things and settings, without folders."""
+    lag = latency_step.measure(sweep_part.read_sweep(tank, "bottom", "latency"))
+    frames = probe_step.look(sweep_part.read_sweep(tank, "wires", "probe"), lag_s=lag.lag.seconds)
+    probe = probe_step.calibrate(frames, rig.probe, tank_calibration.Settings(temperature_c=sweep_sets.WATER_C))
+    found = metrics.read(result / "metrics.json")
+    for name, figures in {"latency": lag.figures, "probe": probe.figures}.items():
+        timeless = {f"{name}_{key}": value for key, value in figures.items() if not key.startswith("seconds_")}
+        assert {key: found[key] for key in timeless} == pytest.approx(timeless, rel=1e-12, nan_ok=True)
 
 
 def test_nothing_is_done_twice(result, tank, capsys):

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +13,40 @@ from recon.capture import probe_files
 from recon.files import metrics
 from recon.files.written_files import LIST
 from recon.probe_calibration.repeatability import five_points
+from scenes.board_poses import Config as BoardPoses
+from sonotwin import choices, rendered_session, session_accuracy
 from sonotwin.cli import main
+from sonotwin.rendered_session import Rendering
+from sonotwin.verbs import sweep
 from twin.evaluation import session_errors, sweep_errors, track_errors
+from twin.shooting import FilmQuality, FrameShooting
+from twin.ultrasound.probe_path import SurfacePath
+from twin.ultrasound.timed_sweep import Clocks
 
-COARSE = ["filmed=true", "frames.quality.disc=1", "frames.quality.rim=4"]
+COARSE = FrameShooting(quality=FilmQuality(disc=1, rim=4))
+STROKE = {"start_mm": (-18, -12), "end_mm": (-18, 8), "speed_mm_s": 20}
+
+
+def parts(out: Path) -> Iterator[Rendering]:
+    """Parts of a session as accuracy has them, fewer and coarser."""
+    usual = session_accuracy.settings("ideal", 0)
+    small = {
+        "poses": BoardPoses.model_validate(choices.read("poses", "demo")),
+        "tracing": usual.tracing.model_copy(update={"samples": 4}),
+        "path": SurfacePath.model_validate(choices.read("path", "stroke") | STROKE),
+        "clocks": Clocks(camera_hz=20),
+    }
+    chosen = usual.model_copy(update=small | {"wires": 20, "bottom_s": 4.0})
+    for part in rendered_session.parts(chosen, out, bottom_hz=15.0):
+        coarse = {"frames": COARSE} if isinstance(part.settings, sweep.Config) else {}
+        yield replace(part, settings=part.settings.model_copy(update=coarse))
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("session") / "out"
-    place = [f"out={out}", "add=true"]
-    board = ["scene=board", "poses=demo", "patterns=paper_calibration", "cameras=[cam1,cam2]", "tracing.samples=4"]
-    assert main(["render", *board, *place]) == 0
-    assert main(["render", "scene=breast", "tracing.samples=4", *place]) == 0
-    water = ["ultrasound=water", *COARSE]
-    wires = ["scene=crosswire", "path=wire", "path.count=20", "clocks.camera_hz=5", "name=wires"]
-    assert main(["sweep", *wires, *water, *place]) == 0
-    assert main(["sweep", "scene=tank", "path=bob", "path.seconds=4", "clocks.camera_hz=15", "name=bottom", *water, *place]) == 0
-    stroke = ["path.start_mm=[-18,-12]", "path.end_mm=[-18,8]", "path.speed_mm_s=20", "clocks.camera_hz=20"]
-    assert main(["sweep", *stroke, "name=scan", *COARSE, *place]) == 0
+    for part in parts(out):
+        part.run()
     return out
 
 

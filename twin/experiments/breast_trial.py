@@ -15,10 +15,9 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Unsure
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
-from recon.segmentation import masses
-from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import contain
-from recon.segmentation.refraction import Sound
+from recon.session import masses_step
+from recon.session.masses_step import Method
 from scenes.acoustics import TISSUES
 from scenes.catalogue import build_scene
 from scenes.scene_types import Thing
@@ -61,8 +60,7 @@ def segmented(lab: FilmedLaboratory, sweep: TrackedSweep, probe: ProbeCalibratio
     scans = freehand_scans.in_memory(
         freehand_scans.of_sweep(sweep.ours, probe, lab.latency_s, speed, Unsure(lab.settings.noise.latency_s))
     )
-    found = masses.from_scans(scans.stream, scans.shape, scans.world_from_pixel, Sound(speed), blur=Blur())
-    return [mass.mesh for mass in found]
+    return list(masses_step.find(scans, Method(overlays=0)).meshes.values())
 
 
 def from_masks(lab: FilmedLaboratory, sweep: TrackedSweep, probe: ProbeCalibration) -> list[trimesh.Trimesh]:

@@ -15,11 +15,10 @@ import trimesh
 
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
-from recon.probe_calibration import crossing_frames, tank_calibration
 from recon.probe_calibration.crossing_frames import CrossingFrames
 from recon.probe_calibration.tank_calibration import Result
 from recon.probe_calibration.tank_calibration import Settings as Tank
-from recon.structured_light.surface_mesh import clean, mesh
+from recon.session import probe_step, skin_step
 from recon.structured_light.triangulate import triangulate
 from recon.tracking import networks
 from recon.tracking.networks import Networks
@@ -102,9 +101,7 @@ def wires(lab: FilmedLaboratory, number: int) -> TrackedSweep:
 def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
     """The first 30 B-scans in which the crossing is seen while both methods have a pose."""
     own, seen = sweep.ours, np.isfinite(sweep.published_at(lab.latency_s)).all(axis=(1, 2))
-    found = crossing_frames.look(
-        own.name, own.images(), own.size, own.frames, own.poses(lab.latency_s), own.pose_covariance(lab.latency_s)
-    )
+    found = probe_step.look(own, lag_s=lab.latency_s)
     kept = found.usable[seen[found.usable]][: probe_accuracy.IMAGES]
     some = tuple(replace(one, reason=one.reason or (None if k in kept else NOT_KEPT)) for k, one in enumerate(found.crossings))
     return replace(found, sightings=found.sightings.of(np.isin(found.usable, kept)), crossings=some)
@@ -112,8 +109,7 @@ def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
 
 def calibrated(lab: FilmedLaboratory, found: CrossingFrames) -> Result:
     """Our calibration."""
-    crossing_frames.refuse_few(found)
-    return tank_calibration.calibrate(found, lab.rig.probe, Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0))
+    return probe_step.calibrate(found, lab.rig.probe, Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0)).result
 
 
 def published(lab: FilmedLaboratory, found: CrossingFrames, sweep: TrackedSweep, rng: np.random.Generator) -> Solved:
@@ -133,4 +129,4 @@ def by_light(lab: FilmedLaboratory, scene: dict) -> Shot:
 def meshed(shot: Shot, calibration: Calibration) -> trimesh.Trimesh:
     """The surface of a decoded shot by a calibration."""
     camera, projector = calibration.cameras["cam1"], calibration.cameras["projector"]
-    return mesh(clean(triangulate(shot.found, camera, projector), camera, shot.found.modulation), camera)
+    return skin_step.surface_of(shot.found, triangulate(shot.found, camera, projector), camera).mesh

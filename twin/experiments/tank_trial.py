@@ -15,8 +15,10 @@ from recon.geometry.primitives import Cylinder, fit_cylinder
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration import point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.tank_calibration import Result
-from recon.segmentation import segmented_scans, tube_cover
+from recon.segmentation import tube_cover
 from recon.segmentation.tube_wall import Appearance
+from recon.session import masses_step
+from recon.session.masses_step import Method
 from scenes.catalogue import build_scene
 from twin import conditions
 from twin.evaluation.surface_errors import rms
@@ -92,7 +94,7 @@ def cylinder_figures(lab: FilmedLaboratory, ours: ProbeCalibration, paper: Probe
     surface = filmed_laboratory.meshed(shot, lab.optics.ours)
     water = float(sound_in_water.speed_of_sound(WATER_C))
     scans = freehand_scans.of_sweep(sweep.ours, ours, lab.latency_s, water, Unsure(lab.settings.noise.latency_s))
-    found = segmented_scans.find_tube(scans, overlays=0, surface=surface).figures
+    found = masses_step.find(scans, Method(kind="tube", overlays=0), surface).figures
     plain = filmed_laboratory.meshed(as_published(shot, lab.settings.patterns), lab.optics.light)
     theirs = published_cylinders(sweep, paper, lab.latency_s, plain)
     (inner,), (outer, *_) = (cylinders_of(scene) for scene in (INNER, OUTER))

@@ -11,6 +11,7 @@ from recon.capture.images import write_images
 from recon.capture.manifest import image_name
 from recon.capture.sweep_part import SweepCapture
 from recon.model.calibration import Calibration
+from recon.session import poses_step
 from recon.tracking import results
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -60,9 +61,10 @@ def track(planned: PlannedSweep, optics: Optics, networks: Networks, ranges: Dat
     recipe, theirs = published_recipe(networks), pair(optics.cameras)
     steps, matrices = [], []
     film = planned.film(ranges)
-    for time, frames in zip(film.times.tolist(), film.frames(), strict=True):
-        steps.append(results.kept(tracker.step(*frames.views, time * 1e-9), time))
-        matrix = recipe(theirs, frames.views)
+    followed = poses_step.follow(tracker, film.times, (frames.views for frames in film.frames()))
+    for time, (views, found) in zip(film.times.tolist(), followed, strict=True):
+        steps.append(results.kept(found, time))
+        matrix = recipe(theirs, views)
         matrices.append(np.full((4, 4), np.nan) if matrix is None else matrix)
     paths = tuple(folder / settings.name / image_name(number) for number in range(len(plan.times)))
     shown = []
