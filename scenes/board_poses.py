@@ -73,7 +73,7 @@ def _orientation(tilt_deg: float, draw: Array) -> Array:
     """
     quarter, beside = np.divmod(4 * draw[0], 1)
     askew = 2.0  # power that draws turns to the quarters: half of them lie within 11 deg
-    turn = np.pi / 2 * (quarter + 0.5 * _drawn(2 * beside - 1, askew))
+    turn = np.pi / 2 * (quarter + 0.5 * _draw(2 * beside - 1, askew))
     tilt, way = np.deg2rad(tilt_deg) * np.sqrt(draw[1]), 2 * np.pi * draw[2]
     tilted = Rotation.from_rotvec(tilt * np.array([np.cos(way), np.sin(way), 0]))
     return (tilted * Rotation.from_rotvec([0, 0, turn])).as_matrix()
@@ -118,7 +118,7 @@ def _place(hull: Array, depth: float, draw: Array, margin: float, devices: Seque
         return None
     middle = room[np.linalg.norm(room - room.mean(axis=0), axis=1).argmin()]
     outwards = 0.3  # power that draws poses from the middle to the corners of the room
-    square = _drawn(2 * draw - 1, outwards)
+    square = _draw(2 * draw - 1, outwards)
     away = max(np.abs(square).max(), 1e-9)
     border = np.append(np.abs(room - middle)[:, :2].max(axis=0) * square / away, 0)
     near, far = 0.0, 2.0
@@ -128,7 +128,7 @@ def _place(hull: Array, depth: float, draw: Array, margin: float, devices: Seque
     return middle + near * away * border
 
 
-def _drawn(values: Array, power: float) -> Array:
+def _draw(values: Array, power: float) -> Array:
     """Values from -1 to 1 drawn to zero (power above 1) or away from it (below)."""
     return np.sign(values) * np.abs(values) ** power
 

@@ -70,7 +70,7 @@ def dome(form: Form, rng: np.random.Generator) -> Dome:
     vertices = np.column_stack([plan, z + raised])
     texture = 0.8 * smooth_noise(vertices, 3.2, rng) + 0.6 * smooth_noise(vertices, 9, rng)
     vertices[:, 2] += form.relief * inland * texture
-    return Dome(_fitted(vertices, form.size), faces, int((ring == ring[-1]).sum()), areola, nipple, bumps)
+    return Dome(_fit(vertices, form.size), faces, int((ring == ring[-1]).sum()), areola, nipple, bumps)
 
 
 def disc(rings: int) -> tuple[Faces, Array, Faces]:
@@ -170,7 +170,7 @@ def _areola(form: Form, offset: Array, rng: np.random.Generator) -> tuple[Array,
     return areola, nipple, bumps, raised
 
 
-def _fitted(vertices: Array, size: tuple[float, float, float]) -> Array:
+def _fit(vertices: Array, size: tuple[float, float, float]) -> Array:
     """Stretch by the last percent to the exact size, centred on the origin and standing on z = 0."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     fitted = (vertices - (low + high) / 2) * (np.array(size) / (high - low))

@@ -90,7 +90,7 @@ def _held(
     if held(sighting, guide.so_far) is None:
         return _Outcome(False, f"not kept: {reason}")
     if reason and not whatever:
-        return _refused(reason)
+        return _refuse(reason)
     fringes, unlit = session.sequence(plan.shown, [FRINGE_CAMERA])
     bits = session.stage.cameras[FRINGE_CAMERA].bits
     contrast = frame_checks.contrast(fringes[FRINGE_CAMERA], plan.patterns, bits, plan.limits)
@@ -100,11 +100,11 @@ def _held(
     faults = [*unlit, *frame_checks.fringe_faults(contrast, plan.limits)]
     reason = reason or sentence(faults) or ("" if verdict.accepted else verdict.reason)
     if reason and not whatever:
-        return _refused(reason)
+        return _refuse(reason)
     recording.add_pose(lit, fringes, plan.board, plan.patterns, session.devices(plan.patterns.projector_size))
     guide.accept(sighting, verdict)
     return _Outcome(True, f"kept though {reason}" if reason else verdict.reason)
 
 
-def _refused(reason: str) -> _Outcome:
+def _refuse(reason: str) -> _Outcome:
     return _Outcome(False, f"not kept: {reason} (k takes the board as it is held, and keeps the pose)")

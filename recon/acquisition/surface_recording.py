@@ -69,11 +69,11 @@ def _moved(before: dict[str, NDArray], after: dict[str, NDArray]) -> list[str]:
     return [
         f"{name} moved: its image changed by {100 * change:.1f} % meanwhile; lay all things still"
         for name in before
-        if (change := _changed(before[name], after[name])) > still
+        if (change := _change(before[name], after[name])) > still
     ]
 
 
-def _changed(before: NDArray, after: NDArray) -> float:
+def _change(before: NDArray, after: NDArray) -> float:
     """Relative RMS change between two images : (h, w), of means of blocks."""
     first, second = (_blocks(image) for image in (before, after))
     return float(np.sqrt(np.mean((second - first) ** 2)) / max(np.sqrt(np.mean(first**2)), 1e-9))

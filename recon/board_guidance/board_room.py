@@ -153,7 +153,7 @@ def candidates(board: Board, cameras: Mapping[str, Camera], reach: Reach, count:
     """
     found: list[Array] = []
     for _ in range(BATCHES):
-        poses = _drawn(board, next(iter(cameras.values())), reach, rng)
+        poses = _draw(board, next(iter(cameras.values())), reach, rng)
         found.append(poses[fits(poses, board, cameras, reach)])
         if sum(map(len, found)) >= count:
             break
@@ -166,7 +166,7 @@ def candidates(board: Board, cameras: Mapping[str, Camera], reach: Reach, count:
     return np.concatenate(found)[:count]
 
 
-def _drawn(board: Board, camera: Camera, reach: Reach, rng: np.random.Generator) -> Array:
+def _draw(board: Board, camera: Camera, reach: Reach, rng: np.random.Generator) -> Array:
     """Poses : (BATCH, 4, 4) whose middle lies in a camera's view."""
     depth = rng.choice(np.linspace(*reach.depth_mm, LEVELS), BATCH)
     rays = camera.rays(rng.uniform(size=(BATCH, 2)) * (np.array(camera.size) - 1.0))

@@ -60,7 +60,7 @@ def with_sighting(so_far: SoFar, sighting: Sighting) -> SoFar:
         raise InputError(
             f"{sighting.name}: expected camera 1 to see {ENOUGH} points of the board or more, found fewer; show all of it"
         )
-    return _adjusted(replace(so_far, sightings=(*so_far.sightings, sighting)))
+    return _adjust(replace(so_far, sightings=(*so_far.sightings, sighting)))
 
 
 def held(sighting: Sighting, so_far: SoFar) -> Array | None:
@@ -75,7 +75,7 @@ def held(sighting: Sighting, so_far: SoFar) -> Array | None:
     return rigid.from_rotation_vector(np.ravel(turn), np.ravel(shift)) if found else None
 
 
-def _adjusted(so_far: SoFar) -> SoFar:
+def _adjust(so_far: SoFar) -> SoFar:
     """Adjust all devices to all sightings, if they determine them; else lay the poses by the rig's description."""
     poses = np.array([held(sighting, so_far) for sighting in so_far.sightings])
     so_far = replace(so_far, poses=poses, misfit=np.zeros((len(poses), len(so_far.sizes))))

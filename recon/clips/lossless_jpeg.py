@@ -5,6 +5,7 @@ Source: ITU-T T.81, annexes B (markers), C and F.2.2.3 (Huffman codes) and H (pr
 
 import struct
 from collections.abc import Iterator
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -15,9 +16,19 @@ from recon.compiled import njit
 
 Codes = NDArray[np.uint16]  # (65536,) length and number of bits that follow, 256 length + bits, by the next 16 bits; 0: none
 
-START, FRAME, CODES, SCAN, RESTART_INTERVAL, END = 0xD8, 0xC3, 0xC4, 0xDA, 0xDD, 0xD9
 PREDICTORS = range(1, 8)
 MOST_BITS = 16  # of a code, of a sample and of a difference
+
+
+class Marker(IntEnum):
+    """Second bytes of markers."""
+
+    START = 0xD8
+    FRAME = 0xC3  # of the lossless process with codes
+    CODES = 0xC4
+    SCAN = 0xDA
+    RESTART_INTERVAL = 0xDD
+    END = 0xD9
 
 
 class _Frame(NamedTuple):
@@ -44,14 +55,14 @@ def decode(data: bytes) -> NDArray[np.uint16]:
         content = data[begin:end]
         if marker in other_frames:
             raise ValueError(f"a JPEG image of another process, SOF{marker - 0xC0}, than the lossless one")
-        if marker == FRAME:
+        if marker == Marker.FRAME:
             frame = _frame(content)
             samples = np.zeros((frame.height, frame.width, len(frame.names)), np.uint16)
-        elif marker == CODES:
+        elif marker == Marker.CODES:
             codes |= _codes(content)
-        elif marker == RESTART_INTERVAL:
+        elif marker == Marker.RESTART_INTERVAL:
             (restart,) = struct.unpack(">H", content)
-        elif marker == SCAN:
+        elif marker == Marker.SCAN:
             if frame is None:
                 raise ValueError("a JPEG scan before its frame")
             places, tables, predictor, shift = _scan(content, frame, codes)
@@ -71,13 +82,13 @@ def decode(data: bytes) -> NDArray[np.uint16]:
 def _segments(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Markers with the begin and end of their contents; coded samples between them are passed over."""
     position = 2
-    if data[:2] != bytes([0xFF, START]):
+    if data[:2] != bytes([0xFF, Marker.START]):
         raise ValueError("no JPEG image")
     while (position := data.find(b"\xff", position)) >= 0 and position + 4 <= len(data):
         marker = data[position + 1]
-        if marker == END:
+        if marker == Marker.END:
             return
-        if marker in (0x00, 0x01, 0xFF, START) or 0xD0 <= marker <= 0xD7:
+        if marker in (0x00, 0x01, 0xFF, Marker.START) or 0xD0 <= marker <= 0xD7:
             position += 1 if marker == 0xFF else 2
             continue
         (length,) = struct.unpack(">H", data[position + 2 : position + 4])
@@ -162,7 +173,7 @@ def _fill(packed, tables, predictor, first, rows, samples):
                     if bits > 0 and step < 1 << (bits - 1):
                         step += 1 - (1 << bits)
                 waiting &= (1 << held) - 1
-                samples[y, x, c] = (_predicted(samples, y, x, c, anew, predictor, first) + step) & 0xFFFF
+                samples[y, x, c] = (_predict(samples, y, x, c, anew, predictor, first) + step) & 0xFFFF
     return True
 
 
@@ -182,7 +193,7 @@ def _more(packed, position, waiting, held):
 
 
 @njit(inline="always")
-def _predicted(samples, y, x, c, anew, predictor, first):
+def _predict(samples, y, x, c, anew, predictor, first):
     """A sample by those to its left, above and between."""
     if anew:
         return first if x == 0 else np.int64(samples[y, x - 1, c])

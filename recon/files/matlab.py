@@ -61,7 +61,7 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
     try:
         order = ORDERS[data[header - 2 : header]]
         for element in _elements(memoryview(data)[header:], order):
-            size, head = _unpacked(*element, order, HEAD)
+            size, head = _unpack(*element, order, HEAD)
             kind, name = _described(head, order)
             objects |= kind in OBJECTS
             name = other_names.get(name, name)
@@ -69,7 +69,7 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
                 continue
             if size > most:
                 raise InputError(f"{path}: {name}: expected a matrix of up to {most >> 20} MiB, found {-(-size >> 20)} MiB")
-            arrays[name] = _matrix(_unpacked(*element, order, size)[1], order)
+            arrays[name] = _matrix(_unpack(*element, order, size)[1], order)
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, ValueError, StopIteration, struct.error, zlib.error):
@@ -81,7 +81,7 @@ def read(path: Path, forms: Mapping[str, Form], other_names: Mapping[str, str]) 
     return arrays
 
 
-def _unpacked(kind: int, content: Buffer, order: str, most: int) -> tuple[int, Buffer]:
+def _unpack(kind: int, content: Buffer, order: str, most: int) -> tuple[int, Buffer]:
     """Bytes of the array in an element, and the first ones of them, unpacked if need be; 0 and none of anything else."""
     if kind != COMPRESSED:
         return (len(content), content[:most]) if kind == MATRIX else (0, b"")

@@ -7,6 +7,7 @@ Source: RFC 8794 (EBML) and RFC 9559 (Matroska).
 """
 
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -14,13 +15,41 @@ from recon.errors import InputError
 from recon.files.regular import opened
 
 START = b"\x1a\x45\xdf\xa3"
-SEGMENT, INFO, TRACKS, CLUSTER, GROUP = 0x18538067, 0x1549A966, 0x1654AE6B, 0x1F43B675, 0xA0
-ENTRY, PICTURE = 0xAE, 0xE0  # a track; what its images are
-HOLDERS = {SEGMENT, INFO, TRACKS, CLUSTER, GROUP, ENTRY, PICTURE}
-SCALE, TIME, SIMPLE, BLOCK = 0x2AD7B1, 0xE7, 0xA3, 0xA1
-NUMBER, KIND, CODEC, NAME, COLOUR, WIDTH, HEIGHT, ENCODINGS = 0xD7, 0x83, 0x86, 0x536E, 0x2EB524, 0xB0, 0xBA, 0x6D80
 VIDEO, TEXTS = 1, (0x11, 0x21)  # kinds of tracks
 MOST_TEXT = 1 << 20  # bytes of a field
+
+
+class Element(IntEnum):
+    """Elements of a file that are read, by their numbers."""
+
+    SEGMENT = 0x18538067
+    INFO = 0x1549A966
+    SCALE = 0x2AD7B1
+    TRACKS = 0x1654AE6B
+    TRACK = 0xAE
+    NUMBER = 0xD7
+    KIND = 0x83
+    CODEC = 0x86
+    NAME = 0x536E
+    PICTURE = 0xE0  # what a track's images are
+    COLOUR = 0x2EB524
+    WIDTH = 0xB0
+    HEIGHT = 0xBA
+    ENCODINGS = 0x6D80
+    CLUSTER = 0x1F43B675
+    TIME = 0xE7
+    GROUP = 0xA0
+    SIMPLE = 0xA3
+    BLOCK = 0xA1
+
+
+HOLDERS = {
+    *(Element.SEGMENT, Element.INFO, Element.TRACKS, Element.TRACK, Element.PICTURE, Element.CLUSTER, Element.GROUP),
+}
+OF_TRACKS = {
+    *(Element.NUMBER, Element.KIND, Element.CODEC, Element.NAME, Element.COLOUR, Element.WIDTH, Element.HEIGHT),
+    Element.ENCODINGS,
+}
 
 
 @dataclass
@@ -55,7 +84,7 @@ class Matroska:
 
     def of_kind(self, *kinds: int) -> list[int]:
         """Numbers of the tracks of some kinds."""
-        return [number for number, track in self.tracks.items() if track.number(KIND) in kinds]
+        return [number for number, track in self.tracks.items() if track.number(Element.KIND) in kinds]
 
 
 def read(path: Path) -> Matroska:
@@ -80,19 +109,19 @@ def read(path: Path) -> Matroska:
             begin, length = stream.tell(), size or 0
             if begin + length > end or (size is None and element not in HOLDERS):
                 raise _damaged(path, at)
-            if element == ENTRY:
+            if element == Element.TRACK:
                 tracks.append(Track())
             if element in HOLDERS:
                 at = begin
                 continue
             at = begin + length
-            if element in (NUMBER, KIND, CODEC, NAME, COLOUR, WIDTH, HEIGHT, ENCODINGS) and tracks:
+            if element in OF_TRACKS and tracks:
                 tracks[-1].values[element] = stream.read(min(length, MOST_TEXT))
-            elif element == SCALE:
+            elif element == Element.SCALE:
                 scale = int.from_bytes(stream.read(min(length, 8)), "big")
-            elif element == TIME:
+            elif element == Element.TIME:
                 time = int.from_bytes(stream.read(min(length, 8)), "big")
-            elif element in (SIMPLE, BLOCK):
+            elif element in (Element.SIMPLE, Element.BLOCK):
                 track = _number(path, stream)
                 after, flags = int.from_bytes(stream.read(2), "big", signed=True), stream.read(1)
                 if track is None or not flags or stream.tell() > at or (count := count + 1) > most_blocks:
@@ -101,10 +130,12 @@ def read(path: Path) -> Matroska:
                     raise InputError(f"{path}: expected a frame in each block, found several in one at byte {begin}")
                 frame = Frame((time + after) * scale, stream.tell(), at - stream.tell())
                 frames.setdefault(track, []).append(frame)
-    packed = [track for track in tracks if ENCODINGS in track.values]
+    packed = [track for track in tracks if Element.ENCODINGS in track.values]
     if packed:
-        raise InputError(f"{path}: expected tracks that aren't packed, found {packed[0].text(NAME) or 'one'} packed or encrypted")
-    return Matroska({track.number(NUMBER): track for track in tracks}, frames)
+        raise InputError(
+            f"{path}: expected tracks that aren't packed, found {packed[0].text(Element.NAME) or 'one'} packed or encrypted"
+        )
+    return Matroska({track.number(Element.NUMBER): track for track in tracks}, frames)
 
 
 def _number(path: Path, stream: BinaryIO, marked: bool = False) -> int | None:

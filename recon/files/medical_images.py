@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError, brief, short
 from recon.files import matroska, video_file
-from recon.files.matroska import Frame
+from recon.files.matroska import Element, Frame
 from recon.files.regular import check_there, opened
 
 META_TYPES = {
@@ -258,24 +258,24 @@ def _matroska(path: Path) -> ImageFile:
     if len(videos) != 1:
         raise fault(path, "tracks", "one of images", len(videos))
     track, frames = file.tracks[videos[0]], tuple(file.frames[videos[0]])
-    width, height = track.number(matroska.WIDTH), track.number(matroska.HEIGHT)
+    width, height = track.number(Element.WIDTH), track.number(Element.HEIGHT)
     uncompressed, grey = "V_UNCOMPRESSED", "Y800"  # of images in a Matroska file
-    coded = track.text(matroska.CODEC) != uncompressed
+    coded = track.text(Element.CODEC) != uncompressed
     if coded:
         frames = tuple(sorted(frames))  # as they are shown, which may not be the order in which they are decoded
-    channels = 1 if track.text(matroska.COLOUR) == grey and not coded else 3
+    channels = 1 if track.text(Element.COLOUR) == grey and not coded else 3
     wrong = [frame.length for frame in frames if frame.length != width * height * channels]
     most_px = 1 << 26  # of a video's images
     if not 0 < width * height <= most_px or (wrong and not coded):
         raise fault(path, "frames", f"{width} x {height} pixels of {channels} bytes", f"{(wrong or [0])[0]} bytes")
-    fields = {"Kinds": "domain domain list", "TrackName": track.text(matroska.NAME)}
+    fields = {"Kinds": "domain domain list", "TrackName": track.text(Element.NAME)}
     of_time: dict[int, list[int]] = {}
     for number, frame in enumerate(frames):
         of_time.setdefault(frame.time_ns, []).append(number)
         fields[f"Seq_Frame{number:04d}_Timestamp"] = repr(frame.time_ns * 1e-9)
     with opened(path) as stream:
         for text in file.of_kind(*matroska.TEXTS):
-            name, used = file.tracks[text].text(matroska.NAME), dict[int, int]()
+            name, used = file.tracks[text].text(Element.NAME), dict[int, int]()
             for frame in file.frames.get(text, []):
                 k = used[frame.time_ns] = used.get(frame.time_ns, -1) + 1  # frames of one time take texts in their order
                 numbers = of_time.get(frame.time_ns, [])
@@ -286,7 +286,7 @@ def _matroska(path: Path) -> ImageFile:
     return ImageFile(path, fields, (width, height, len(frames)), np.dtype("u1"), False, path, 0, channels, frames, coded)
 
 
-def _decoded(file: ImageFile) -> Iterator[bytes]:
+def _decode(file: ImageFile) -> Iterator[bytes]:
     """Images of a Matroska file : (h, w, 3), red first, one by one."""
     video, shape = video_file.opened(file.path), (file.size[1], file.size[0], 3)
     try:
@@ -301,7 +301,7 @@ def _decoded(file: ImageFile) -> Iterator[bytes]:
 
 def _pieces(file: ImageFile) -> Iterator[bytes]:
     if file.coded:
-        yield from _decoded(file)
+        yield from _decode(file)
         return
     if file.frames:
         with opened(file.path) as stream:

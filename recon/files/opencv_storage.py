@@ -186,7 +186,7 @@ def _length(path: Path, name: str, value: Any) -> int:
 def _numbers(path: Path, name: str, value: Any, dtype: np.dtype) -> NDArray:
     """Numbers : (n,) of a type, from a list, a single one, or packed ones."""
     if isinstance(value, str) and value.startswith(BASE64):
-        return _unpacked(path, name, value, dtype)
+        return _unpack(path, name, value, dtype)
     listed = [_of_word(one) if isinstance(one, str) else one for one in (value if isinstance(value, list) else [value])]
     wrong = next((one for one in listed if isinstance(one, bool) or not isinstance(one, int | float)), None)
     if wrong is not None or None in listed:
@@ -203,7 +203,7 @@ def _numbers(path: Path, name: str, value: Any, dtype: np.dtype) -> NDArray:
     return numbers.astype(dtype)
 
 
-def _unpacked(path: Path, name: str, text: str, dtype: np.dtype) -> NDArray:
+def _unpack(path: Path, name: str, text: str, dtype: np.dtype) -> NDArray:
     """Numbers : (n,) of a type, packed as base64 after a header that names it."""
     try:
         data = base64.b64decode("".join(text.removeprefix(BASE64).split()), validate=True)

@@ -135,7 +135,7 @@ def entries(folder: Path) -> set[str]:
         If a folder can't be read, of which there may be more than is seen.
     """
     found = set[str]()
-    for place, folders, files in os.walk(folder, onerror=_raised):
+    for place, folders, files in os.walk(folder, onerror=_raise_error):
         links = [name for name in folders if os.path.islink(os.path.join(place, name))]
         inside = PurePosixPath(Path(place).relative_to(folder).as_posix())
         found |= {str(inside / name) for name in (*files, *links)}
@@ -144,7 +144,7 @@ def entries(folder: Path) -> set[str]:
     return {name for name in found if not _is_mark(folder, name)}
 
 
-def _raised(error: OSError) -> None:
+def _raise_error(error: OSError) -> None:
     if not isinstance(error, FileNotFoundError):  # of another process at work there, whose folder has gone
         raise error
 

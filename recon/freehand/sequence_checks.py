@@ -68,7 +68,7 @@ def read_tracking(
     frames, left_out = without_implausible(path, frames, own, numbers, numbers)
     if tracker is not None and tracked is not None:
         tracked, more = without_implausible(tracker, tracked, others, tracked.times_s, times_s)
-        frames, left_out = _joined(path, frames, tracker, tracked), left_out + more
+        frames, left_out = _join(path, frames, tracker, tracked), left_out + more
     if names:
         moving = [k for k, name in enumerate(chain) if name in names and _moves(frames.transforms[name], frames.valid[name])]
         passed = [of]
@@ -112,7 +112,7 @@ def _without_implausible(
     return replace(frames, valid=valid), len(left_out)
 
 
-def _joined(path: Path, frames: Frames, tracker: Path, tracked: Frames) -> Frames:
+def _join(path: Path, frames: Frames, tracker: Path, tracked: Frames) -> Frames:
     """The frames with the transforms of another file, between two of its rows by time; those of the first go before.
 
     A transform that is the same in all rows holds always, if it is valid in all of them.

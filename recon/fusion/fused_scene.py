@@ -11,6 +11,7 @@ from recon.files import meshes
 from recon.files.meshes import painted, pictured
 from recon.freehand.scans import Scans
 from recon.fusion import probe_shape
+from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import Target
@@ -18,8 +19,6 @@ from recon.segmentation.mass_files import FoundMass
 
 Array = NDArray[np.float64]
 
-SKIN, TABLE, MASS = (224, 187, 165, 150), (120, 105, 90, 255), (200, 60, 60, 255)  # colours
-PATH, DEVICE, BODY, INK = (60, 140, 220, 255), (90, 90, 90, 255), (235, 235, 235, 255), (20, 20, 20, 255)
 GREY_SKIN, GREY_TABLE = (255, 240, 230, 170), (255, 255, 255, 255)  # over which the surface's own grey is laid
 STEP_MM = 1.0  # of the surfaces' vertices, which are merged to that
 
@@ -54,17 +53,17 @@ def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
     """All of a scene, by the layers' names, with so many of its B-scans."""
     made = {}
     if scene.skin is not None:
-        made["skin"] = surface_layer(scene.skin, SKIN, GREY_SKIN)
+        made["skin"] = surface_layer(scene.skin, IN_SPACE.skin, GREY_SKIN)
     if scene.rest is not None:
-        made["table"] = surface_layer(scene.rest, TABLE, GREY_TABLE)
-    made |= {name: painted(mass.mesh, MASS) for name, mass in scene.masses.items()}
+        made["table"] = surface_layer(scene.rest, IN_SPACE.table, GREY_TABLE)
+    made |= {name: painted(mass.mesh, IN_SPACE.mass) for name, mass in scene.masses.items()}
     for k in evenly(list(scene.images), scans):
         made[f"scan{k:04d}"] = scan_layer(scene.images[k], scene.scans.world_from_pixel[k])
     if len(scene.path) > 1:
         made["path"] = path_layer(scene.path)
     if scene.middle is not None and scene.scans.probe is not None:
         body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
-        for name, mesh, colour in (("probe", body, BODY), ("circles", rings, INK)):
+        for name, mesh, colour in (("probe", body, IN_SPACE.body), ("circles", rings, IN_SPACE.ink)):
             made[name] = painted(mesh.copy().apply_transform(scene.world_from_target[scene.middle]), colour)
     return made | {name: device_layer(camera) for name, camera in scene.devices.items()}
 
@@ -97,7 +96,7 @@ def path_layer(places: Array) -> trimesh.Trimesh:
     pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends]
     whole = trimesh.util.concatenate(pieces)
     assert isinstance(whole, trimesh.Trimesh)
-    return painted(whole, PATH)
+    return painted(whole, IN_SPACE.path)
 
 
 def device_layer(camera: Camera) -> trimesh.Trimesh:
@@ -107,7 +106,7 @@ def device_layer(camera: Camera) -> trimesh.Trimesh:
     device_mm = 40.0  # length of a device's pyramid
     vertices = np.vstack([camera.centre, camera.centre + device_mm * camera.rays(corners)])
     faces = [[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]]
-    return painted(trimesh.Trimesh(vertices, faces, process=False), DEVICE)
+    return painted(trimesh.Trimesh(vertices, faces, process=False), IN_SPACE.device)
 
 
 def merged(mesh: trimesh.Trimesh, step_mm: float) -> trimesh.Trimesh:

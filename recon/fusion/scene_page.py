@@ -11,6 +11,7 @@ from recon.files.meshes import greys_of
 from recon.files.metrics import Metrics
 from recon.fusion import probe_shape
 from recon.fusion.fused_scene import FusedScene, evenly, merged
+from recon.fusion.palette import ON_PAGE
 from recon.reports import page, space_views, sweep_player
 from recon.reports.page import Opening, Section
 from recon.reports.space_views import Lines, Shape
@@ -20,7 +21,6 @@ from recon.segmentation.mass_files import FoundMass
 Array = NDArray[np.float64]
 
 VIEW, SCAN = "scene", "B-scan"
-SKIN, TABLE, MASS, PATH, BODY, INK, DEVICE = "#f2e0d2", "#c9bfb2", "#c8553d", "#3c8cdc", "#d8d8d4", "#202020", "#5a5a5a"
 STEP_MM = 1.5  # of the surfaces' vertices in the view
 SLIDES = 60  # B-scans that the slider passes
 FOOTER = "Measured in the frame of camera 1; nothing is registered."
@@ -62,7 +62,7 @@ def reel_of(scene: FusedScene) -> Reel | None:
     if not numbers or scene.scans.probe is None:
         return None
     body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
-    parts = (("probe", body, BODY), ("circles", rings, INK))
+    parts = (("probe", body, ON_PAGE.body), ("circles", rings, ON_PAGE.ink))
     moving = [Shape(name, mesh.vertices, mesh.faces, colour) for name, mesh, colour in parts]
     labels = [f"B-scan {k} of {len(scene.scans.world_from_pixel)}" for k in numbers]
     images = [scene.images[k] for k in numbers]
@@ -71,19 +71,19 @@ def reel_of(scene: FusedScene) -> Reel | None:
 
 def _bodies(scene: FusedScene) -> Iterator[Shape]:
     """Everything that has a surface and rests."""
-    for name, mesh, colour, opacity in (("skin", scene.skin, SKIN, 0.45), ("table", scene.rest, TABLE, 1.0)):
+    for name, mesh, colour, opacity in (("skin", scene.skin, ON_PAGE.skin, 0.45), ("table", scene.rest, ON_PAGE.table, 1.0)):
         if mesh is not None:
             coarse = merged(mesh, STEP_MM)
             yield Shape(name, coarse.vertices, coarse.faces, colour, opacity, greys=greys_of(coarse))
     for name, mass in scene.masses.items():
         coarse = merged(mass.mesh, STEP_MM / 2)
-        yield Shape(name, coarse.vertices, coarse.faces, MASS)
+        yield Shape(name, coarse.vertices, coarse.faces, ON_PAGE.mass)
 
 
 def _wires(scene: FusedScene) -> Iterator[Lines]:
     """The path of the array's face, and the devices' views."""
     if len(scene.path) > 1:
-        yield Lines("path", scene.path[None], PATH)
+        yield Lines("path", scene.path[None], ON_PAGE.path)
     ray_mm = 60.0  # of a device, towards the corners of its view
     for name, camera in scene.devices.items():
         width, height = camera.size
@@ -91,7 +91,7 @@ def _wires(scene: FusedScene) -> Iterator[Lines]:
         ends = camera.centre + ray_mm * camera.rays(corners)
         round_ = np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)
         edges = np.stack([np.broadcast_to(camera.centre, ends.shape), ends], axis=1)
-        yield Lines(name, np.concatenate([edges, round_]), DEVICE, shown=False)  # far away
+        yield Lines(name, np.concatenate([edges, round_]), ON_PAGE.device, shown=False)  # far away
 
 
 def numbers(scene: FusedScene) -> Iterator[Section]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
+from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
 from recon.navigation import moment_figures
 from recon.navigation.mass_distances import MassDistance
@@ -25,7 +26,6 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
-SKIN, MASS, BODY, INK = (224, 187, 165), (200, 60, 60), (235, 235, 235), (20, 20, 20)
 FONT, NAME_GAP_PX = (cv2.FONT_HERSHEY_SIMPLEX, 0.5), 4  # of the names, and between them and the outlines
 PANEL_PX = 290  # width of the figures, beside the view
 ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
@@ -124,7 +124,7 @@ def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
             pieces = np.rint(rigid.apply(pixel_from_world, each.outline)[..., :2]).astype(np.int32)
             cv2.polylines(picture, list(pieces), False, outline, 1, cv2.LINE_AA)
             at = name_place(each.name, pieces.reshape(-1, 2), scan.image.shape)
-            for colour, thickness in ((INK, 3), (outline, 1)):
+            for colour, thickness in ((IN_SPACE.ink[:3], 3), (outline, 1)):
                 cv2.putText(picture, each.name, at, *FONT, colour, thickness, cv2.LINE_AA)
     return picture
 
@@ -149,14 +149,14 @@ def _add_scene(server, scene: StillScene):
     """Add what stands still; returns the handle of the probe, which moves."""
     outside, inside = 0.5, 0.1  # opacity of the skin's two sides: where both were alike, a dome would look like a bowl
     if scene.skin is not None:
-        _add_mesh(server, "/skin", scene.skin, SKIN, "front", outside)
-        _add_mesh(server, "/skin/inside", scene.skin, SKIN, "back", inside)
+        _add_mesh(server, "/skin", scene.skin, IN_SPACE.skin[:3], "front", outside)
+        _add_mesh(server, "/skin/inside", scene.skin, IN_SPACE.skin[:3], "back", inside)
     for name, mesh in scene.masses.items():
-        _add_mesh(server, f"/masses/{name}", mesh, MASS)
+        _add_mesh(server, f"/masses/{name}", mesh, IN_SPACE.mass[:3])
         top = np.array([mesh.bounds[:, 0].mean(), mesh.bounds[0, 1], mesh.bounds[:, 2].mean()])  # y of the world is down
         server.scene.add_label(f"/names/{name}", name, position=top * M, anchor="bottom-center", font_screen_scale=0.8)
     handle = server.scene.add_frame("/probe", show_axes=False, visible=False)
-    for name, mesh, colour in (("body", scene.probe, BODY), ("circles", scene.circles, INK)):
+    for name, mesh, colour in (("body", scene.probe, IN_SPACE.body[:3]), ("circles", scene.circles, IN_SPACE.ink[:3])):
         if mesh is not None:
             _add_mesh(server, f"/probe/{name}", mesh, colour)
     server.scene.set_up_direction((0.0, -1.0, 0.0))

@@ -101,10 +101,10 @@ def _model_names(masses: Iterable[str]) -> list[str]:
     names: list[str] = []
     for mass in masses:
         whole = (mass[:1].upper() + mass[1:]).encode(errors="replace").decode()  # a file's name may hold what is no text
-        name, number = _shortened(whole), 1
+        name, number = _shorten(whole), 1
         while name in OWN or name in names:
             number += 1
-            name = _shortened(whole, f"~{number}")
+            name = _shorten(whole, f"~{number}")
         if name != whole:
             why = f"its name is taken, or longer than {MOST_NAME_BYTES} bytes"
             log.warning("OpenIGTLink: mass %s is sent as %s: %s", short(mass), name, why)
@@ -112,7 +112,7 @@ def _model_names(masses: Iterable[str]) -> list[str]:
     return names
 
 
-def _shortened(name: str, end: str = "") -> str:
+def _shorten(name: str, end: str = "") -> str:
     """A name with an end, of at most as many bytes as a message has room for."""
     return name.encode()[: MOST_NAME_BYTES - len(end)].decode(errors="ignore") + end
 

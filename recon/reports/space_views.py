@@ -62,7 +62,7 @@ def surface_view(points: Map, error: Map, half_range: float = 0.1) -> str:
     """
     shown = np.isfinite(points).all(axis=-1) & np.isfinite(error)
     coarse = _thinned(shown, VERTICES)
-    vertices, triangles = _triangulated(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
+    vertices, triangles = _triangulate(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
     mesh = _mesh(
         vertices,
         triangles,
@@ -81,7 +81,7 @@ def surface_shape(points: Map, shown: Mask, name: str, colour: str, opacity: flo
     shown = shown & np.isfinite(points).all(axis=-1)
     fewer_vertices = 12_000  # of a surface that is there for what lies under it
     coarse = _thinned(shown, fewer_vertices)
-    vertices, triangles = _triangulated(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
+    vertices, triangles = _triangulate(np.where(shown[coarse][..., None], points[coarse], np.float32(np.nan)))
     return Shape(name, vertices, triangles, colour, opacity)
 
 
@@ -161,7 +161,7 @@ def _thinned(shown: Mask, most: int) -> tuple[slice, slice]:
     return (slice(stride // 2, None, stride),) * 2
 
 
-def _triangulated(points: Map) -> tuple[Map, NDArray[np.int32]]:
+def _triangulate(points: Map) -> tuple[Map, NDArray[np.int32]]:
     """Vertices : (n, 3) and triangles : (m, 3) of a grid of points : (h, w, 3) with holes, less the long ones across a tear."""
     known = np.isfinite(points).all(axis=-1)
     number = np.cumsum(known).reshape(known.shape).astype(np.int32) - 1

@@ -64,11 +64,11 @@ def player(view: str, reel: Reel, first: int) -> str:
         "sheet": reel.sheet,
         "rows": thinned.shape[1],
         "columns": thinned.shape[2],
-        "greys": _packed(thinned),
-        "sheets": _packed(np.float32(sheets[:, :3])),
+        "greys": _pack(thinned),
+        "sheets": _pack(np.float32(sheets[:, :3])),
         "bodies": [each.name for each in reel.bodies],
-        "shapes": [_packed(np.float32(each.vertices)) for each in reel.bodies],
-        "poses": _packed(np.float32(reel.world_from_target[:, :3])),
+        "shapes": [_pack(np.float32(each.vertices)) for each in reel.bodies],
+        "poses": _pack(np.float32(reel.world_from_target[:, :3])),
         "labels": list(reel.labels),
     }
     text = Template(TEMPLATE.read_text(encoding="utf-8"))
@@ -76,5 +76,5 @@ def player(view: str, reel: Reel, first: int) -> str:
     return text.substitute(name=view, last=len(reel.images) - 1, first=first, reel=packed)
 
 
-def _packed(values: NDArray) -> str:
+def _pack(values: NDArray) -> str:
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -76,10 +76,10 @@ def corrected(masses: Sequence[Mass], power: EchoPower, planes: Planes, fit: Fit
     """Masses without what blur and fit do to their surfaces; `power` is that in which they were found."""
     made = echoes(masses, grid_of(power.volume), planes)
     again = fit(masses, EchoPower(made.volume, np.where(made.seen, power.weight, 0)))
-    return [_moved(*both) for both in zip(masses, again, strict=True)]
+    return [_move(*both) for both in zip(masses, again, strict=True)]
 
 
-def _moved(found: Mass, again: Mass) -> Mass:
+def _move(found: Mass, again: Mass) -> Mass:
     """A mass less the difference between what is found of it again and itself."""
     vertices = np.asarray(found.mesh.vertices)
     off = signed_distances(vertices, again.mesh)

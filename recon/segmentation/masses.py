@@ -188,12 +188,12 @@ def rough(power: EchoPower) -> list[Mass]:
     be shadows of borders.
     """
     spacing = power.volume.spacing[::-1]
-    smooth = _smoothed(power.volume.voxels, power.weight, LIMITS.smooth_mm / spacing)
+    smooth = _smooth(power.volume.voxels, power.weight, LIMITS.smooth_mm / spacing)
     seen = np.isfinite(smooth)
     tissue = np.minimum(power.volume.voxels, 2.0)
     bright = seen.copy()
     for _ in range(3):
-        level = _smoothed(tissue, power.weight * bright, LIMITS.around_mm / spacing)
+        level = _smooth(tissue, power.weight * bright, LIMITS.around_mm / spacing)
         bright = seen & (smooth > LIMITS.dark * np.nan_to_num(level, nan=np.inf))
     ratio = np.where(seen, smooth / level, 1.0)
     dark = seen & (ratio < LIMITS.dark)
@@ -208,7 +208,7 @@ def rough(power: EchoPower) -> list[Mass]:
         part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(parts[number - 1], margin, strict=True))
         inside = labels[part] == number
         volume = inside.sum() * float(np.prod(spacing))
-        touches = (_widened(inside, LIMITS.edge_mm, spacing) & unknown[part]).any()
+        touches = (_widen(inside, LIMITS.edge_mm, spacing) & unknown[part]).any()
         cut = any(s.start < m or s.stop > n - m for s, m, n in zip(parts[number - 1], edge, dark.shape, strict=True))
         core = np.median(ratio[part][inside])
         if volume < LIMITS.least_mm3 or core > LIMITS.seed or touches or cut:
@@ -227,7 +227,7 @@ def rough(power: EchoPower) -> list[Mass]:
             told = "a dark body of %.0f mm3 at %.0f, %.0f, %.0f mm is left out: it lies behind one that is cut, maybe its shadow"
             log.warning(told, volume, *_middle(inside, part, power))
         else:
-            field = np.where(_widened(inside, LIMITS.grow_mm, spacing), ratio[part], 1.0)
+            field = np.where(_widen(inside, LIMITS.grow_mm, spacing), ratio[part], 1.0)
             result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
     return result
 
@@ -257,7 +257,7 @@ def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power:
         small = volume < CUT.least_mm3 or height < CUT.least_mm or height > LIMITS.streak * max(across, along)
         if small or np.quantile(ratio[part][inside], CUT.darkest) > LIMITS.seed or whole[part][inside].mean() > CUT.same:
             continue
-        shell, behind = _widened(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
+        shell, behind = _widen(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
         before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
         beside, before = shell & ~behind & ~before, shell & before
         sides = {
@@ -276,7 +276,7 @@ def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power:
         border, way = max(sides, key=lambda name: sides[name])
         told = "a dark body is cut by %s, and is left out: %.0f mm3 of it at %.0f, %.0f, %.0f mm, %.0f x %.0f x %.0f mm; %s"
         log.warning(told, border, volume, *_middle(inside, middle, power), *extents, way)
-        near = _widened(inside, 2 * LIMITS.grow_mm, spacing)
+        near = _widen(inside, 2 * LIMITS.grow_mm, spacing)
         below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
         shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
     return shadowed[pad:-pad, pad:-pad, pad:-pad]
@@ -311,7 +311,7 @@ def _risen(ratio: NDArray) -> Mask:
     return result
 
 
-def _smoothed(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
+def _smooth(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
     fields = (np.asarray(field, np.float32) for field in (weight, values * weight))
     share, total = threads.mapped(lambda field: _blurred(field, sigma), fields)
     return np.divide(total, share, out=np.full_like(total, np.nan), where=share > 0.02)
@@ -330,12 +330,12 @@ def _blurred(field: Map, sigma: Array) -> Map:
 
 def _opened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """The voxels of a mask that lie in balls which fit into it, or no more than `BESIDE_MM` away."""
-    core = ~_widened(~mask, radius_mm, spacing)
+    core = ~_widen(~mask, radius_mm, spacing)
     beside_mm = 0.25  # half of the widest voxel
-    return mask & _widened(core, radius_mm + beside_mm, spacing)
+    return mask & _widen(core, radius_mm + beside_mm, spacing)
 
 
-def _widened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
+def _widen(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
     """Voxels no farther than a radius from a mask's: a dilation by a ball, disc by disc."""
     reach = np.floor(radius_mm / spacing).astype(int)
     aside, down, across = (np.arange(-n, n + 1) * one for n, one in zip(reach, spacing, strict=True))

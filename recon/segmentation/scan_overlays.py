@@ -17,13 +17,13 @@ def of_masks(images: Iterable[NDArray[np.uint8]], masks: Iterable[Mask], count: 
     """Draw the borders of masks : n of (h, w) over some of n B-scans."""
     outlines = {k: mask for k, mask in enumerate(masks) if mask.sum() >= LEAST_PX}
     chosen = spread({k: int(mask.sum()) for k, mask in outlines.items()}, count)
-    return [_drawn_over(image, _contours(outlines[k])) for k, image in enumerate(images) if k in chosen]
+    return [_draw_over(image, _contours(outlines[k])) for k, image in enumerate(images) if k in chosen]
 
 
 def of_outlines(images: Iterable[NDArray[np.uint8]], outlines: Mapping[int, NDArray], count: int) -> list[Overlay]:
     """Draw open outlines : (m, 2) px, by the numbers of their images, over some of n B-scans."""
     chosen = spread({k: len(outline) for k, outline in outlines.items()}, count)
-    return [_drawn_over(image, [outlines[k]], closed=False) for k, image in enumerate(images) if k in chosen]
+    return [_draw_over(image, [outlines[k]], closed=False) for k, image in enumerate(images) if k in chosen]
 
 
 def spread(sizes: Mapping[int, int], count: int) -> set[int]:
@@ -32,7 +32,7 @@ def spread(sizes: Mapping[int, int], count: int) -> set[int]:
     return {max(part.tolist(), key=lambda k: sizes[k]) for part in parts}
 
 
-def _drawn_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bool = True) -> Overlay:
+def _draw_over(image: NDArray[np.uint8], outlines: Sequence[NDArray], closed: bool = True) -> Overlay:
     """A B-scan in colour, with outlines : (m, 2) px."""
     result = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for outline in outlines:

@@ -74,7 +74,7 @@ def _losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, 
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         u, v, within, passed = (a[rows] for a in (lines.u, lines.v, lines.within, lines.passed))
         power = table[image[rows, ::thinned]]
-        away = _sampled(inside, matrix, u, v)
+        away = _sample(inside, matrix, u, v)
         used = (away > clear_mm) & (away < FAR_MM - 0.2) & (passed > 0.5)
         bins = np.minimum(v[used] * scale[1], DEPTH_BINS - 1).astype(int) * PATH_BINS
         return bins + np.minimum(within[used], PATH_BINS - 1).astype(int), power[used] / passed[used]
@@ -102,7 +102,7 @@ def _fitted_losses(total: Array, count: Array) -> tuple[float, float]:
     return float(max(by_depth, 0.0)), float(np.clip(by_path, 0.0, most_by_path))
 
 
-def _sampled(inside: Volume, world_from_pixel: Array, u: NDArray, v: NDArray) -> Array:
+def _sample(inside: Volume, world_from_pixel: Array, u: NDArray, v: NDArray) -> Array:
     """Signed distance at pixels, mm."""
     voxel_from_pixel = np.linalg.inv(inside.world_from_voxel) @ world_from_pixel
     i, j, k = np.moveaxis(rigid.apply(voxel_from_pixel, np.stack([u, v, 0 * u], axis=-1)), -1, 0)

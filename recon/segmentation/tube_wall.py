@@ -94,14 +94,14 @@ def find(image: NDArray, scale: Array, appearance: Appearance | None = None) -> 
     least_arc_deg = 70.0  # of first echoes; less leaves the radius to chance
     if np.ptp(directions) < np.deg2rad(least_arc_deg):
         return _none(f"an arc of {np.rad2deg(np.ptp(directions)):.0f} deg, expected at least {least_arc_deg:.0f}")
-    ring = _measured(level, scale, circle, look, grey)
+    ring = _measure(level, scale, circle, look, grey)
     centrings = 3
     for _ in range(centrings):  # first echoes lie outside of a wide beam's ridge, and rays have to meet the wall square
         refined = _algebraic(ring.pixels * scale) if ring.found else None
         if refined is None:
             return ring
         circle = refined
-        ring = _measured(level, scale, circle, look, grey)
+        ring = _measure(level, scale, circle, look, grey)
     if not look.diameter_mm[0] <= 2 * circle[2] <= look.diameter_mm[1]:
         return _none(f"a diameter of {2 * circle[2]:.1f} mm, expected {look.diameter_mm[0]:g} to {look.diameter_mm[1]:g}")
     return ring
@@ -130,7 +130,7 @@ def fit_tube(rings: Sequence[Ring], world_from_pixel: Array) -> Tube:
     points = np.concatenate([in_world(rings[k].pixels, world_from_pixel[k]) for k in used])
     frames = np.concatenate([np.full(len(rings[k].pixels), k) for k in used])
     covariance = np.concatenate([_turned(rings[k].covariance, world_from_pixel[k]) for k in used])
-    return _weighted(points, covariance, frames)
+    return _weigh(points, covariance, frames)
 
 
 def scale_sigma(rings: Sequence[Ring], world_from_pixel: Array, tube: Tube, probe: ProbeCalibration) -> float:
@@ -203,7 +203,7 @@ def _algebraic(points: Array) -> Array | None:
     return np.array([solution[0], solution[1], np.sqrt(square)]) if rank == 3 and square > 0 else None
 
 
-def _measured(level: NDArray[np.float32], scale: Array, circle: Array, look: Appearance, grey: float) -> Ring:
+def _measure(level: NDArray[np.float32], scale: Array, circle: Array, look: Appearance, grey: float) -> Ring:
     """Edges along rays from the rough centre, less those off a smooth outline, with their scatter about it."""
     step_deg = 1.0  # between rays
     half_arc_deg = 85.0  # of rays, on either side of the wall's front
@@ -295,7 +295,7 @@ def _turned(covariance: Array, world_from_pixel: Array) -> Array:
     return jacobian @ covariance @ jacobian.T
 
 
-def _weighted(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tube:
+def _weigh(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tube:
     """Cylinder of least weighted squares; its radius' variance from the sums over images, whose points err together."""
     start = fit_cylinder(points).shape
     first, _, _ = np.linalg.svd(start.axis[:, None])

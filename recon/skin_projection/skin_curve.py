@@ -45,7 +45,7 @@ def laid(name: str, kind: Kind, chain: Array, sight: Sight, skin: trimesh.Trimes
     hit = hits.faces != NOWHERE
     if not hit.any():
         return SkinCurve(name, kind, hits.points, np.full_like(hits.points, np.nan))
-    points = _bridged(hits.points, chain, sight, skin)
+    points = _bridge(hits.points, chain, sight, skin)
     normals = np.asarray(skin.vertex_normals)[skin.faces[hits.faces[hit]]].mean(axis=1)
     number = np.arange(len(chain))
     normals = np.column_stack([np.interp(number, number[hit], axis) for axis in normals.T])  # over holes, too
@@ -99,7 +99,7 @@ def strip(curve: SkinCurve, width_mm: float, above_mm: float = 0.0) -> trimesh.T
     return mesh
 
 
-def _bridged(points: Array, chain: Array, sight: Sight, skin: trimesh.Trimesh) -> Array:
+def _bridge(points: Array, chain: Array, sight: Sight, skin: trimesh.Trimesh) -> Array:
     """A curve's points on the skin : (n, 3) mm, with those over small holes, which are NaN, bridged.
 
     Gloss leaves such holes where it saturates the cameras. The skin around one is fitted by a quadratic on the chart: over 8 mm

@@ -58,7 +58,7 @@ def block(rng: np.random.Generator) -> list[Part]:
     parts = [Part(_slot(rng), lofts.prism(outline, size[2], rng.uniform(0.3, 2)), False)]
     if rng.uniform() < 0.4:
         lid = lofts.prism(outline * rng.uniform(0.5, 1.04), rng.uniform(1, 6), 0.3)
-        parts.append(Part(_slot(rng), _lifted(lid, size[2] - 0.2), False))
+        parts.append(Part(_slot(rng), _lift(lid, size[2] - 0.2), False))
     return parts
 
 
@@ -72,7 +72,7 @@ def tool(rng: np.random.Generator) -> list[Part]:
         path = np.linspace([0, 0, 0], [0, 0, grip], 9)
         scale = np.array([0.6, 0.85, 1, 1, 0.95, 0.92, 0.97, 0.8, 0.45])
         handle = lofts.tube(path, outline, scale)
-        shaft = _lifted(lofts.rod(rng.uniform(2, 4), blade, 16), grip - 2)
+        shaft = _lift(lofts.rod(rng.uniform(2, 4), blade, 16), grip - 2)
         up = rigid.transform(np.eye(3), [-grip, 0, thick]) @ lying
         return [Part(_slot(rng), lofts.placed(handle, up), True), Part("metal", lofts.placed(shaft, up), True)]
     if kind == "pen":
@@ -102,7 +102,7 @@ def washer(rng: np.random.Generator) -> list[Part]:
     if rng.uniform() < 0.6:
         return [Part(rng.choice(["metal", "thing_a", "thing_b"]), mesh, False)]
     plate = lofts.prism(lofts.rounded(rng.uniform(2.2, 4, 2) * radius, 2), 3, 0.3)
-    return [Part(_slot(rng), plate, False), Part(_slot(rng), _lifted(mesh, 2.8), False)]
+    return [Part(_slot(rng), plate, False), Part(_slot(rng), _lift(mesh, 2.8), False)]
 
 
 def profile(rng: np.random.Generator) -> list[Part]:
@@ -116,7 +116,7 @@ def profile(rng: np.random.Generator) -> list[Part]:
         for _ in range(4):
             outline.append(points)
             points = points @ turns[0].T
-        bar = _extruded(np.concatenate(outline), length)
+        bar = _extrude(np.concatenate(outline), length)
         up = rigid.from_rotation_vector([0, np.pi / 2, 0], [-length / 2, 0, half])
         return [Part(rng.choice(["metal", "thing_a"]), lofts.placed(bar, up), False)]
     thick = rng.uniform(5, 20)
@@ -136,7 +136,7 @@ def tank(rng: np.random.Generator) -> list[Part]:
     parts = [Part(rng.choice(THINGS), mesh, False)]
     if rng.uniform() < 0.5:
         water = lofts.prism(lofts.rounded([length - 2 * wall - 0.4, width - 2 * wall - 0.4], 4, 4), height * 0.6)
-        parts.append(Part(rng.choice(THINGS), _lifted(water, wall + 0.1), False))
+        parts.append(Part(rng.choice(THINGS), _lift(water, wall + 0.1), False))
     return parts
 
 
@@ -147,7 +147,7 @@ def screw(rng: np.random.Generator) -> list[Part]:
         radius, length = rng.uniform(1.5, 4), rng.uniform(8, 60)
         shank = lofts.rod(radius, length, 16)
         socket = lofts.superellipse((1.9 * radius, 1.9 * radius), 2, int(rng.choice([6, 24])))
-        head = _lifted(lofts.prism(socket, 1.6 * radius, 0.3), -1.5 * radius)
+        head = _lift(lofts.prism(socket, 1.6 * radius, 0.3), -1.5 * radius)
         mesh = lofts.joined([shank, head])
         if rng.uniform() < 0.7:
             mesh = lofts.placed(mesh, rigid.from_rotation_vector([0, np.pi / 2, 0], [0, 0, 1.9 * radius]))
@@ -162,7 +162,7 @@ def monitor(rng: np.random.Generator) -> list[Part]:
     """A slab with a panel set into it: a tablet lying flat, or a monitor that stands or leans."""
     size, thick = rng.uniform([120, 80], [320, 220]), rng.uniform(7, 25)
     case = lofts.prism(lofts.rounded(size, rng.uniform(2, 12), 4), thick, 1.5)
-    panel = _lifted(lofts.prism(lofts.rounded(size - rng.uniform(8, 24), 1), 1.0), thick - 0.6)
+    panel = _lift(lofts.prism(lofts.rounded(size - rng.uniform(8, 24), 1), 1.0), thick - 0.6)
     pitch = rng.choice([0.0, rng.uniform(0.2, 1.3)])
     rotation = Rotation.from_rotvec([pitch, 0, 0]).as_matrix()
     pose = rigid.transform(rotation, [0, 0, size[1] / 2 * np.sin(pitch)])
@@ -192,7 +192,7 @@ def _slot(rng: np.random.Generator) -> str:
     return str(rng.choice([*THINGS, "metal"], p=[0.3, 0.3, 0.25, 0.15]))
 
 
-def _lifted(mesh: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
+def _lift(mesh: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
     return lofts.placed(mesh, rigid.transform(np.eye(3), [0, 0, height]))
 
 
@@ -219,6 +219,6 @@ def _ring(outer: float, inner: float, height: float, centre: list[float]) -> tri
     return mesh if mesh.volume > 0 else trimesh.Trimesh(mesh.vertices, faces[:, ::-1], process=False)
 
 
-def _extruded(outline: Array, length: float) -> trimesh.Trimesh:
+def _extrude(outline: Array, length: float) -> trimesh.Trimesh:
     """A star-shaped outline : (n, 2) about the origin, drawn along z."""
     return lofts.loft([np.column_stack([outline, np.full(len(outline), z)]) for z in (0.0, length)])

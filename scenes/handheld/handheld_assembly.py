@@ -52,7 +52,7 @@ def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None)
     holder, cable_in_front = _choices(choice_rng, ranges)
     board, parts = build_board(board_rng, *draw_front(board_rng, target, ranges.board), ranges.thickness_mm)
     target_from_body, probe, beside = _probe_pose(probe_rng, board, ranges)
-    parts += [_moved(part, target_from_body) for part in parts_of(probe, lens(probe_rng), probe_rng)]
+    parts += [_move(part, target_from_body) for part in parts_of(probe, lens(probe_rng), probe_rng)]
     parts += _bracket(bracket_rng, board, probe, target_from_body)
     discs = circle_layout.circle_centres(target)[:, :2]
     if holder == "hand":
@@ -91,7 +91,7 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
     aside = target_from_body[:2, 3] - board.middle
     beside = np.append(lofts.unit(aside), 0.0) if np.linalg.norm(aside) > BEHIND_MM else np.array([1.0, 0.0, 0.0])
     lens_mm = np.array([array_mm + 2, lens(probe_rng)[1]])
-    parts += [_moved(part, target_from_body) for part in parts_of(housing, lens_mm, probe_rng)]
+    parts += [_move(part, target_from_body) for part in parts_of(housing, lens_mm, probe_rng)]
     parts += _bracket(bracket_rng, board, housing, target_from_body)
     discs = circle_centres(target)[:, :2]
 
@@ -132,7 +132,7 @@ def _choices(rng: np.random.Generator, ranges: Ranges) -> tuple[str, bool]:
     return holder, bool(holder in ("none", "hand") and rng.uniform() < ranges.cable_in_front / other)
 
 
-def _moved(part: Part, to_from: Array) -> Part:
+def _move(part: Part, to_from: Array) -> Part:
     return Part(part.slot, lofts.placed(part.mesh, to_from), part.smooth)
 
 

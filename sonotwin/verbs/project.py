@@ -35,6 +35,7 @@ from recon.files.metrics import Metrics
 from recon.freehand import scans as freehand_scans
 from recon.fusion import fused_scene, probe_shape
 from recon.fusion import skin as skin_parts
+from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import NotNegative, Part, Rig, Vector
@@ -331,8 +332,8 @@ def write(
         (folder / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
     curve_files.write_json(folder / CURVES, curves)
     curve_files.write_ply(folder / STRIPS, curves, lines)
-    shown = {"skin": fused_scene.surface_layer(skin, fused_scene.SKIN, fused_scene.GREY_SKIN)}
-    shown |= {name: meshes.painted(mass, fused_scene.MASS) for name, mass in masses.items()}
+    shown = {"skin": fused_scene.surface_layer(skin, IN_SPACE.skin, fused_scene.GREY_SKIN)}
+    shown |= {name: meshes.painted(mass, IN_SPACE.mass) for name, mass in masses.items()}
     strips = curve_files.strips([*curves, *names], lines)
     shown |= {f"{name}_light": meshes.painted(strip, LIGHT) for name, strip in strips.items()}
     meshes.write_layers(folder / SCENE, shown)

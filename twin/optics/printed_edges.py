@@ -87,7 +87,7 @@ def compute_edges(image: Images, optics: CameraOptics, board: Print, world_from_
     chosen = _Tables(*(table[edges] for table in tables))
     shares = _black_shares(view, board, chosen, _footprint(optics), _sample_points(), turns)
     transmission = optics.transmission.ravel()[edges]
-    found = _mixed(image / optics.transmission, kinds, edges, shares) * transmission
+    found = _mix(image / optics.transmission, kinds, edges, shares) * transmission
     known = np.isfinite(found)
     image.ravel()[edges[known]] = found[known]
     return Left(edges[~known].astype(np.uint32), np.flatnonzero(kinds == SIDE).astype(np.uint32))
@@ -245,7 +245,7 @@ def _at_fraction(table, fraction):
     return table[below] + (position - below) * (table[below + 1] - table[below])
 
 
-def _mixed(image: Images, kinds: NDArray[np.uint8], edges: NDArray[np.int64], shares: Array) -> Array:
+def _mix(image: Images, kinds: NDArray[np.uint8], edges: NDArray[np.int64], shares: Array) -> Array:
     """Black and white in their shares : (m,), NaN where one of them isn't known."""
     values = np.full(len(edges), np.nan)
     in_threads(_fill_mixed, len(edges), image, kinds, edges, shares, values)

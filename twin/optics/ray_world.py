@@ -91,13 +91,13 @@ def _to_bsdf(material: Material, has_albedo: bool, has_wet: bool = False) -> dic
     if material.roughness is None:
         dry = {"type": "diffuse", "reflectance": reflectance}
     else:
-        dry = _coated(reflectance, material.roughness, material.ior)
+        dry = _coat(reflectance, material.roughness, material.ior)
     if not has_wet:
         return dry
     gel_roughness, gel_ior = 0.08, 1.36  # GGX alpha of gel as it levels out, assumed; its index is near water's
-    same = _body_reflection(dry) / _body_reflection(_coated(reflectance, gel_roughness, gel_ior))
+    same = _body_reflection(dry) / _body_reflection(_coat(reflectance, gel_roughness, gel_ior))
     under_gel = _ramp(0, same) if has_albedo else same * material.reflectance
-    return {"type": "blendbsdf", "weight": _ramp(1), "dry": dry, "wet": _coated(under_gel, gel_roughness, gel_ior)}
+    return {"type": "blendbsdf", "weight": _ramp(1), "dry": dry, "wet": _coat(under_gel, gel_roughness, gel_ior)}
 
 
 def _body_reflection(bsdf: dict) -> float:
@@ -109,7 +109,7 @@ def _body_reflection(bsdf: dict) -> float:
     )
 
 
-def _coated(reflectance: dict | float, roughness: float, ior: float) -> dict:
+def _coat(reflectance: dict | float, roughness: float, ior: float) -> dict:
     """A diffuse body under a rough dielectric coat."""
     return {
         "type": "roughplastic",

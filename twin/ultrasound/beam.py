@@ -49,7 +49,7 @@ class Beam(NamedTuple):
     elevation_energy: Array  # (h,)
 
 
-def _diffracted(
+def _diffract(
     offsets: Array, depth: float, aperture: float, focus: float, wavelength: float, apodised: bool
 ) -> NDArray[np.complex128]:
     """Field H : (n,) of an aperture at offsets : (n,) mm from its axis, at a depth; `apodised` by a Hann window."""
@@ -98,8 +98,8 @@ def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
         offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
         receive = float(_receive_aperture(transducer, depth))
-        sent = _diffracted(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
-        table[k] = sent * _diffracted(offsets, depth, receive, depth, wavelength, apodised=True) / receive
+        sent = _diffract(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
+        table[k] = sent * _diffract(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
     faint = 2e-3  # of the peak: the point spread ends there (-54 dB)
     seen = np.abs(table) >= faint * np.abs(table).max(axis=1, keepdims=True)

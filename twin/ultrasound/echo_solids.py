@@ -151,9 +151,9 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
         across = min(_spacing(thing), float(np.sqrt(8 * shape.radius * sag_mm)))
         steps = np.where(np.abs(shape.axis) > 1 - 1e-9, _spacing(thing), across)  # along the axis the wall is straight
-        return _sampled(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), steps)
+        return _sample(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), steps)
     if thing.primitive is not None:
-        return _sampled(thing, tissue, thing.primitive.distance, np.full(3, _spacing(thing)))
+        return _sample(thing, tissue, thing.primitive.distance, np.full(3, _spacing(thing)))
     if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
         distance, steps = _box(bounds)
         return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)
@@ -183,7 +183,7 @@ def _check_count(name: str, counts: Array) -> None:
         raise InputError(f"scene: {name}: expected a thing whose grid has up to {most_points:g} points, found {points:.2g}")
 
 
-def _sampled(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:
+def _sample(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:
     points, low = _grid(thing, steps)
     values = np.stack([distance(sheet.reshape(-1, 3)).reshape(sheet.shape[:-1]) for sheet in points])
     return Solid(thing.name, tissue, values.astype(np.float32), low, steps, thing.mesh)

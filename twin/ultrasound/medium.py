@@ -108,11 +108,11 @@ def _half_thickness(beam: Beam, pose: Array, main: int, edge: float, fanned: boo
 @njit(inline="always")
 def hashed(i, j, k, seed):
     """64 random bits of a cell, by the finaliser of SplitMix64 (Steele, Lea and Flood 2014) over the mixed coordinates."""
-    return _mixed(np.uint64(i) * MIX[0] ^ np.uint64(j) * MIX[1] ^ np.uint64(k) * MIX[2], seed)
+    return _mix(np.uint64(i) * MIX[0] ^ np.uint64(j) * MIX[1] ^ np.uint64(k) * MIX[2], seed)
 
 
 @njit(inline="always")
-def _mixed(x, seed):
+def _mix(x, seed):
     """64 random bits of folded coordinates."""
     x = x + seed * np.uint64(0xD6E8FEB86659FD93)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -207,7 +207,7 @@ def _hash_places(places, found, cell, start, lattice, seed):
     mix, mask, bit = MIX[main], np.uint64(2**BITS - 1), edge / 2**BITS
     p, q, r = places[P, found : found + RUN], places[Q, found : found + RUN], places[R, found : found + RUN]
     for n in range(RUN):
-        bits = _mixed(folded ^ np.uint64(start + n) * mix, seed)
+        bits = _mix(folded ^ np.uint64(start + n) * mix, seed)
         p[n], q[n], r[n] = bits & mask, (bits >> np.uint64(BITS)) & mask, (bits >> np.uint64(2 * BITS)) & mask
     for axis in range(3):
         corner = edge * (cell[first] * to[axis, first] + cell[second] * to[axis, second]) + to[axis, 3]

@@ -101,7 +101,7 @@ def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed:
         if stroke:
             places.append(_eased(one + (stroke - 1) * aside, one + stroke * aside, path.step_seconds)[1:-1])
         places.append(_eased(one + stroke * aside, other + stroke * aside, duration))
-    faces = np.stack([_placed(path, place, solid, transducer) for place in np.concatenate(places)])
+    faces = np.stack([_place(path, place, solid, transducer) for place in np.concatenate(places)])
     return _led(faces, path.hand, shaken, transducer, seed)
 
 
@@ -185,7 +185,7 @@ def _upright(turn_deg: float) -> Array:
     return np.column_stack([array, depth, np.cross(array, depth)])
 
 
-def _placed(path: SurfacePath, place: Array, solid: Solid, transducer: Transducer) -> Array:
+def _place(path: SurfacePath, place: Array, solid: Solid, transducer: Transducer) -> Array:
     """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
     axes = _upright(path.turn_deg)
     foot_mm = 8.0  # width of the probe's foot across the array

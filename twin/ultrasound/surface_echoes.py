@@ -310,7 +310,7 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
             value *= _unaliased(2 * order * scanner.wavenumber * slope_z * ACROSS_MM)
             if order == 1 and mirror < 1:
                 phase = _phase_of_patch(ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth, scanner.seed)
-                value += _scattered(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
+                value += _scatter(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
             if value != 0:
                 echo = np.complex64(strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]
                 beside = paths.shift_mm[line, min(int(order * y / paths.step_mm), depths - 1)]
@@ -320,7 +320,7 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
 
 
 @njit(inline="always")
-def _scattered(mirror, z1, z2, square, area, scanner):
+def _scatter(mirror, z1, z2, square, area, scanner):
     """Amplitude that roughness sends to all sides, by Lambert's law: cos / pi of the power a steradian."""
     diffuse = 2 * np.pi / scanner.wavenumber / np.sqrt(np.pi * area)
     return (z2 - z1) / (z2 + z1) * diffuse * np.sqrt(1 - mirror * mirror) * np.sqrt(square)

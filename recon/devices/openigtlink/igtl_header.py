@@ -112,7 +112,7 @@ def join(version: int, kind: str, device: str, time_ns: int | None, body: Body) 
     if len(name) > MOST_NAME_BYTES:
         expected = f"a device's name of at most {MOST_NAME_BYTES} bytes"
         raise InputError(f"OpenIGTLink: expected {expected}, found {short(device)!r} of {len(name)}")
-    whole = bytes(body.content) if version == 1 else _extended(body)
+    whole = bytes(body.content) if version == 1 else _extend(body)
     return HEADER.pack(version, kind.encode(), name, fixed_point(time_ns), len(whole), crc64(whole)) + whole
 
 
@@ -187,7 +187,7 @@ def _divide(data, tables, found):
     found[0] = rest
 
 
-def _extended(body: Body) -> bytes:
+def _extend(body: Body) -> bytes:
     """A body with extended header and metadata."""
     entries = [(key.encode(), *encoded(value)) for key, value in body.metadata.items()]
     index = struct.pack(">H", len(entries)) + b"".join(ENTRY.pack(len(key), code, len(value)) for key, code, value in entries)

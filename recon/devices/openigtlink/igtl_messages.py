@@ -199,7 +199,7 @@ def _read_transform(content: memoryview) -> Transform:
 def _read_position(content: memoryview) -> Transform:
     if len(content) not in PLACES:
         raise InputError(f"expected {', '.join(map(str, PLACES))} bytes, found {len(content)}")
-    return Transform(_placed(content))
+    return Transform(_place(content))
 
 
 def _read_status(content: memoryview) -> Status:
@@ -222,7 +222,7 @@ def _read_tools(content: memoryview) -> Tools:
 
 
 def _read_turned_tools(content: memoryview) -> Tools:
-    return _tools([(*TURNED_TOOL.unpack(record)[:2], _placed(record[-28:])) for record in _records(content, TURNED_TOOL.size)])
+    return _tools([(*TURNED_TOOL.unpack(record)[:2], _place(record[-28:])) for record in _records(content, TURNED_TOOL.size)])
 
 
 def _tools(found: list[tuple[bytes, int, Array]]) -> Tools:
@@ -258,7 +258,7 @@ def _matrix(content: memoryview) -> Array:
     return matrix
 
 
-def _placed(content: memoryview) -> Array:
+def _place(content: memoryview) -> Array:
     """A place and, after it, a quaternion x, y, z, w or its first three numbers : (4, 4)."""
     numbers = igtl_header.finite(np.frombuffer(content, ">f4"))
     axis = numbers[3:6] if len(numbers) > 3 else np.zeros(3)

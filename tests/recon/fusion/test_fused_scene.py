@@ -9,6 +9,7 @@ import trimesh
 
 from recon.files import meshes
 from recon.fusion import fused_scene
+from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from scenes.solid_meshes import grid
@@ -27,7 +28,7 @@ def test_a_b_scan_lies_where_it_was_taken():
 def test_a_viewers_file_has_the_layers_by_name_in_metres_and_images_the_right_way_up(tmp_path):
     """In glTF, v of a texture grows downwards from the image's upper edge, as a B-scan's depth does."""
     scan = fused_scene.scan_layer(np.zeros((30, 20), np.uint8), np.diag([1.0, 1.0, 1.0, 1.0]))
-    mass = meshes.painted(trimesh.creation.icosphere(radius=5.0), fused_scene.MASS)
+    mass = meshes.painted(trimesh.creation.icosphere(radius=5.0), IN_SPACE.mass)
     meshes.write_layers(tmp_path / "scene.glb", {"scan0000": scan, "mass0": mass})
     data = (tmp_path / "scene.glb").read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
@@ -82,9 +83,7 @@ def test_b_scans_are_chosen_evenly_from_those_with_a_pose(count, expected):
 def test_a_viewers_file_has_the_skins_grey(tmp_path):
     ball = trimesh.creation.icosphere(4, 30.0)
     meshes.set_greys(ball, np.full(len(ball.vertices), 90, np.uint8))
-    meshes.write_layers(
-        tmp_path / "scene.glb", {"skin": fused_scene.surface_layer(ball, fused_scene.SKIN, fused_scene.GREY_SKIN)}
-    )
+    meshes.write_layers(tmp_path / "scene.glb", {"skin": fused_scene.surface_layer(ball, IN_SPACE.skin, fused_scene.GREY_SKIN)})
     data = (tmp_path / "scene.glb").read_bytes()
     content = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
     assert "COLOR_0" in content["meshes"][0]["primitives"][0]["attributes"]
