@@ -9,19 +9,17 @@ the images have a place of their own: by the transform `TToPhysical`, where T is
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator
 
+from recon import registry
 from recon.errors import InputError
 from recon.files import atomic, medical_images
-from recon.files.medical_images import ImageFile
-from recon.freehand import sequence_images
-from recon.model import pose_checks
 from recon.model.probe import ProbeCalibration
 
 Array = NDArray[np.float64]
@@ -57,6 +55,7 @@ STRUCTURE = {  # fields given by the images and the format, in either of the two
 }
 FARTHEST_MM, MOST_SECONDS = 1e7, 9e9  # of a matrix; of a time stamp, that nanoseconds of 64 bits can hold
 FRAME_STRUCTURE = {"Timestamp", "ImageStatus", "Status", ""}
+DIALECTS = "recon.freehand.sequence_dialects"  # a module each
 RAS, LPS = "RAS", "LPS"
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])  # and LPS from RAS
 SHOWN = "Physical"  # where 3D Slicer shows the images, its RAS
@@ -192,6 +191,14 @@ def lies_elsewhere(frames: Frames, reference: str) -> bool:
     return bool(np.abs(placed - np.eye(4)).max(initial=0) > same)
 
 
+def dialect_of(path: Path) -> Any:
+    """The module of `sequence_dialects` that recognises a file, else that of PLUS; InputError if several do."""
+    known = {name: dialect for name, dialect in registry.kinds(DIALECTS).items() if dialect.recognises(path)}
+    if len(known) > 1:
+        raise InputError(f"{path}: expected a sequence of one dialect, found {' and '.join(known)}")
+    return next(iter(known.values()), registry.kind(DIALECTS, "plus_sequence"))
+
+
 def read_sequence(path: Path) -> Frames:
     """Read a whole sequence with its images.
 
@@ -200,33 +207,31 @@ def read_sequence(path: Path) -> Frames:
     InputError
         If the file is damaged or cut short, of another kind, or a field is wrong; the message names it.
     """
-    file = medical_images.read_header(path)
-    frames = _without_images(file)
-    if not sequence_images.has_images(file):
+    frames, shape = read_tracking(path), dialect_of(path).image_shape(path)
+    if shape is None:
         return frames
-    images = np.empty((len(frames.times_s), *sequence_images.turned_shape(file)), np.uint8)
-    for image, read in zip(images, sequence_images.images(file), strict=True):
+    images = np.empty((len(frames.times_s), *shape), np.uint8)
+    for image, read in zip(images, stream_images(path), strict=True):
         image[:] = read
-    return Frames(frames.times_s, frames.transforms, frames.valid, images, frames.frame_fields, frames.fields)
+    return replace(frames, images=images)
 
 
 def read_tracking(path: Path) -> Frames:
     """Read a sequence without its images, which `stream_images` gives one by one: for sequences larger than memory."""
-    return _without_images(medical_images.read_header(path))
+    return dialect_of(path).read_tracking(path)
 
 
 def image_shape(path: Path) -> tuple[int, int]:
     """Height and width of a sequence's images. Raises InputError if it has none."""
-    file = medical_images.read_header(path)
-    if not sequence_images.has_images(file):
-        raise file.fault("DimSize", "images", "tracking only")
-    return sequence_images.turned_shape(file)
+    shape = dialect_of(path).image_shape(path)
+    if shape is None:
+        raise medical_images.fault(path, "DimSize", "images", "tracking only")
+    return shape
 
 
 def stream_images(path: Path) -> Iterator[NDArray[np.uint8]]:
     """The images (h, w) of a sequence one by one; none if it is tracking only. Raises InputError where the data ends early."""
-    file = medical_images.read_header(path)
-    return sequence_images.images(file) if sequence_images.has_images(file) else iter(())
+    return dialect_of(path).images(path)
 
 
 def write_sequence(path: Path, frames: Frames) -> None:
@@ -253,63 +258,10 @@ def write_sequence(path: Path, frames: Frames) -> None:
         stream.write(packed)
 
 
-def _without_images(file: ImageFile) -> Frames:
-    count = sequence_images.layout(file).count
-    fields = {name: value for name, value in file.fields.items() if not FRAME_FIELD.fullmatch(name)}
-    kept = {name: value for name, value in fields.items() if name not in STRUCTURE}
-    table = _frame_table(file, count)
-    transforms, valid = {}, {}
-    status = table.pop("ImageStatus", table.pop("Status", [""] * count))
-    if sequence_images.has_images(file):
-        valid["Image"] = np.array([word.upper() in ("", "OK") for word in status])
-    for key in [key for key in table if key.endswith("Transform")]:
-        name = key.removesuffix("Transform")
-        texts, words = table.pop(key), table.pop(key + "Status", [""] * count)
-        transforms[name], valid[name] = _matrices(file, key, texts, words)
-        if any(word.upper() not in ("", "OK", "INVALID") for word in words):
-            table[key + "Status"] = words
-    times = np.array([_time(file, index, text) for index, text in enumerate(table.pop("Timestamp", [""] * count))])
-    return Frames(times, transforms, valid, None, {name: tuple(texts) for name, texts in table.items()}, kept)
-
-
-def _frame_table(file: ImageFile, count: int) -> dict[str, list[str]]:
-    table: dict[str, list[str]] = {}
-    names = {match[2] for name in file.fields if (match := FRAME_FIELD.fullmatch(name))}
-    # times the fields that are there, which all frames may lack; frames of a file without any
-    most_empty, few_frames = 10, 10_000
-    if (len(names) + 1) * count > most_empty * (len(file.fields) + few_frames):
-        raise file.fault("DimSize", f"frames of which most have fields, as {len(file.fields)} are there", f"{count} frames")
-    for name, text in file.fields.items():
-        if match := FRAME_FIELD.fullmatch(name):
-            if int(match[1]) >= count:
-                raise file.fault(name, f"frames below {count}, their number", match[1])
-            table.setdefault(match[2], [""] * count)[int(match[1])] = text
-    return table
-
-
-def _matrices(file: ImageFile, key: str, texts: list[str], words: list[str]) -> tuple[Array, NDArray[np.bool_]]:
-    matrices, valid = np.tile(np.eye(4), (len(texts), 1, 1)), np.zeros(len(texts), bool)
-    for index, (text, word) in enumerate(zip(texts, words, strict=True)):
-        if not text:
-            continue
-        name = _key(index, key)
-        matrix = medical_images.numbers(file.path, name, text, 16).reshape(4, 4)
-        lost = pose_checks.is_lost(matrix)
-        valid[index] = word.upper() in ("", "OK") and not lost
-        if valid[index] and not is_usable(matrix):
-            raise file.fault(name, "an invertible matrix with the last row 0 0 0 1", repr(text))
-        matrices[index] = np.eye(4) if lost else matrix
-    return matrices, valid
-
-
 def is_usable(matrix: Array) -> bool:
     """Whether a matrix (4, 4) is an invertible affine transform."""
     upright = np.abs(matrix[3] - (0, 0, 0, 1)).max() < 1e-6 and np.abs(matrix).max() < FARTHEST_MM
     return bool(upright and np.linalg.cond(matrix[:3, :3]) < 1e6)
-
-
-def _time(file: ImageFile, index: int, text: str) -> float:
-    return float(medical_images.numbers(file.path, _key(index, "Timestamp"), text, 1)[0]) if text else np.nan
 
 
 def _usable(frames: Frames, name: str) -> Array:
@@ -322,7 +274,9 @@ def _check(path: Path, frames: Frames) -> None:
     if count == 0:
         raise medical_images.fault(path, "frames", "at least one", "none")
     if (endless := np.isinf(frames.times_s)).any():
-        raise medical_images.fault(path, _key(int(endless.argmax()), "Timestamp"), "a finite number or NaN", "an infinite one")
+        raise medical_images.fault(
+            path, frame_key(int(endless.argmax()), "Timestamp"), "a finite number or NaN", "an infinite one"
+        )
     images = frames.images
     if images is not None and (images.ndim != 3 or images.dtype != np.uint8 or len(images) != count or 0 in images.shape):
         raise medical_images.fault(path, "images", f"{count} x height x width of uint8", f"{images.shape} of {images.dtype}")
@@ -332,7 +286,9 @@ def _check(path: Path, frames: Frames) -> None:
         for index, matrix in enumerate(matrices):
             if not np.isfinite(matrix).all() or (frames.valid[name][index] and not is_usable(matrix)):
                 found = repr(" ".join(f"{value:g}" for value in matrix.ravel()))
-                raise medical_images.fault(path, _key(index, name + "Transform"), "an invertible matrix of finite numbers", found)
+                raise medical_images.fault(
+                    path, frame_key(index, name + "Transform"), "an invertible matrix of finite numbers", found
+                )
     for name in [name for name in frames.transforms if not TRANSFORM.fullmatch(name)]:
         raise medical_images.fault(path, "transforms", "names such as ProbeToTracker", repr(name))
     for name, texts in frames.frame_fields.items():
@@ -351,7 +307,8 @@ def _check(path: Path, frames: Frames) -> None:
             raise medical_images.fault(path, name, "a text of one line", repr(text))
 
 
-def _key(index: int, name: str) -> str:
+def frame_key(index: int, name: str) -> str:
+    """Name of a frame's field in a file."""
     return f"Seq_Frame{index:04d}_{name}"
 
 
@@ -367,7 +324,7 @@ def _frame_lines(frames: Frames, sign: str, image_status: str) -> Iterator[str]:
             texts["Timestamp"] = repr(float(time))
         if frames.images is not None:
             texts[image_status] = "OK" if "Image" not in frames.valid or frames.valid["Image"][index] else "INVALID"
-        yield from (f"{_key(index, name)}{sign}{text}" for name, text in texts.items())
+        yield from (f"{frame_key(index, name)}{sign}{text}" for name, text in texts.items())
 
 
 def _meta_head(shape: tuple[int, ...], packed: int, frames: Frames) -> tuple[list[str], list[str]]:

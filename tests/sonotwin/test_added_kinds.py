@@ -1,4 +1,4 @@
-"""A board, and dialects of probes' calibrations and of clips, are each added by one module, found by its name."""
+"""A board, and dialects of probes' calibrations, clips and tracked sequences, are each added by one module, found by its name."""
 
 import cv2
 import numpy as np
@@ -8,6 +8,7 @@ from recon.artwork import board_drawing
 from recon.board_detection.detect import detect
 from recon.capture import probe_files
 from recon.clips import clip_reader
+from recon.freehand import sequences
 from recon.model.boards import Board
 from sonotwin.cli import main
 from tests import added
@@ -109,3 +110,42 @@ def test_another_dialect_of_clips_is_one_module(monkeypatch, tmp_path, rng):
     np.save(tmp_path / "clip.npy", frames)
     clip = clip_reader.read(tmp_path / "clip.npy")
     assert clip.size == (30, 20) and clip.count == 3 and np.array_equal(list(clip.stream()), frames)
+
+
+ARRAYS = '''"""Times, poses and images in one npz."""
+
+import numpy as np
+
+from recon.freehand.sequences import Frames
+
+
+def recognises(path):
+    """Whether its name ends so."""
+    return path.suffix == ".npz"
+
+
+def read_tracking(path):
+    """Times and poses."""
+    held = np.load(path)
+    return Frames(held["times"], {"ProbeToTracker": held["poses"]}, {"ProbeToTracker": np.ones(len(held["times"]), bool)})
+
+
+def image_shape(path):
+    """Height and width."""
+    return np.load(path)["images"].shape[1:]
+
+
+def images(path):
+    """One by one."""
+    return iter(np.load(path)["images"])
+'''
+
+
+def test_another_dialect_of_tracked_sequences_is_one_module(monkeypatch, tmp_path, rng):
+    added.add(monkeypatch, tmp_path / "ours", sequences.DIALECTS, "npz_sequence", ARRAYS)
+    images, poses = rng.integers(0, 255, (4, 20, 30), np.uint8), np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4)
+    np.savez(tmp_path / "sweep.npz", times=np.arange(4.0), poses=poses, images=images)
+    read = sequences.read_sequence(tmp_path / "sweep.npz")
+    assert np.array_equal(read.images, images) and sequences.image_shape(tmp_path / "sweep.npz") == (20, 30)
+    assert np.array_equal(sequences.poses(read, "Tracker", "Probe"), poses)
