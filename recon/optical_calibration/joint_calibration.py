@@ -218,7 +218,7 @@ def _shaped(
 def _tolerances(adjusted: Adjustment, shape: Shape) -> Tolerances:
     """Tolerances of the board by the evidence of the sightings."""
     information, pull = board_information(adjusted)
-    return board_shape.estimated(information, pull, adjusted.problem.observations.points, shape.tolerances)
+    return board_shape.estimate(information, pull, adjusted.problem.observations.points, shape.tolerances)
 
 
 def _lenses(adjusted: Adjustment) -> Array:
@@ -226,7 +226,7 @@ def _lenses(adjusted: Adjustment) -> Array:
     lenses, held = adjusted.lenses.copy(), np.isfinite(adjusted.lenses)
     if held.any():
         most = lens_sigmas(replace(adjusted.problem, lenses=None, tightness={}), adjusted.calibration.cameras)
-        lenses[held] = usual_lenses.estimated(*lens_information(adjusted), lenses[held], most[held])
+        lenses[held] = usual_lenses.estimate(*lens_information(adjusted), lenses[held], most[held])
     return lenses
 
 

@@ -142,6 +142,6 @@ def as_sigma(statistic: float, freedom: int) -> float:
     return float(stats.norm.isf(np.exp(chance) / 2)) if chance > SMALLEST else float(np.sqrt(statistic))
 
 
-def named(findings: Mapping[str, Finding]) -> Sequence[str]:
-    """Parts that are told to have moved, with those that may have instead."""
+def moved_parts(findings: Mapping[str, Finding]) -> Sequence[str]:
+    """Names of moved parts and their rivals."""
     return list(dict.fromkeys(one for name, each in findings.items() if each.named for one in (name, *each.rivals)))
