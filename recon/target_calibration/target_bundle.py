@@ -151,16 +151,11 @@ def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) ->
     covariance[3, 3] += (RIM_BIAS * design.outer_diameter_mm) ** 2
     residuals = _residuals(pairs, devices, unknowns)[used]
     centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in (residuals[:, :CENTRES], residuals[:, CENTRES:]))
-    target = _measured_target(unknowns.target, covariance, design)
-    return Adjusted(target, covariance, noise, centres, shapes, used, tuple(pairs))
-
-
-def _measured_target(values: Array, covariance: Array, design: Target) -> Target:
-    """The design with the values : (7,) of NAMES, and the covariance : (7, 7) of the lengths."""
-    c1, aside, c2, diameter, *curvature = values.tolist()
+    c1, aside, c2, diameter, *curvature = unknowns.target.tolist()
+    update = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": diameter, "curvature_per_m": tuple(curvature)}
     lengths = tuple(tuple(row) for row in covariance[:3, :3].tolist())
-    update = {"c1_mm": c1, "c2_aside_mm": aside, "c2_mm": c2, "outer_diameter_mm": diameter}
-    return design.model_copy(update={**update, "curvature_per_m": tuple(curvature), "covariance_mm2": lengths})
+    target = design.model_copy(update={**update, "covariance_mm2": lengths})
+    return Adjusted(target, covariance, noise, centres, shapes, used, tuple(pairs))
 
 
 def _devices(cameras: Sequence[Camera], optics: Uncertainty | None) -> _Devices:
