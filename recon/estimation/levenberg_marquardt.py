@@ -30,7 +30,7 @@ class Unreachable(ValueError):
     """A step that can not be solved for, or that leads to an estimate that can not be: a shorter one may."""
 
 
-class Equations(Protocol[SomeStep]):
+class LinearSystem(Protocol[SomeStep]):
     """A problem linearised at an estimate, as of `recon.estimation.equations`."""
 
     def step(self, damping: float) -> SomeStep:
@@ -38,7 +38,7 @@ class Equations(Protocol[SomeStep]):
         ...
 
 
-System = TypeVar("System", bound=Equations)
+System = TypeVar("System", bound=LinearSystem)
 
 
 class Descent(NamedTuple, Generic[Estimate, System, Step]):

@@ -100,7 +100,7 @@ def _unit(ways: Sequence[Array]) -> Array:
     return np.stack([each.ravel() / np.sqrt(np.mean(np.sum(each**2, axis=1)) + 1e-30) for each in ways], axis=1)
 
 
-def estimated(information: Array, pull: Array, design: Array, given: Tolerances) -> Tolerances:
+def estimate(information: Array, pull: Array, design: Array, given: Tolerances) -> Tolerances:
     """Tolerances by the evidence, those that are given (above zero) as they are.
 
     Each is the mean over those thought of, weighed by the probability that they give to the sightings.

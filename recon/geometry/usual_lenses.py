@@ -48,7 +48,7 @@ def corner_radius(camera: Camera) -> float:
     return float(np.linalg.norm(np.abs(corners - middle).max(axis=0) / camera.matrix[[0, 1], [0, 1]]))
 
 
-def estimated(information: Array, pull: Array, start: Array, most: Array) -> Array:
+def estimate(information: Array, pull: Array, start: Array, most: Array) -> Array:
     """Standard deviations : (k,) by which coefficients are held to zero, given what the sightings show of them.
 
     Parameters

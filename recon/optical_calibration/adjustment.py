@@ -109,12 +109,15 @@ def adjust(
     problem, (estimate, noise, converged) = _one_to_one(problem, start)
     shaped = replace(problem, released=released or bool(problem.tolerances.sigmas.any()))
     system = linear_system(shaped, estimate, noise)
+    outliers = system.lengths > OUTLIER
+    if PROJECTOR in observations.devices[1:]:  # one is the projector's where it is camera 1's: it was read there
+        outliers[:, :, observations.devices.index(PROJECTOR)] |= outliers[:, :, 0]
     return Adjustment(
         Calibration(estimate.cameras, Uncertainty(problem.names, _covariance(system, problem, estimate))),
         estimate.poses,
         estimate.points,
         np.where(observations.seen[..., None], system.plain, np.nan),
-        _outliers(system.lengths, observations),
+        outliers,
         dict(zip(observations.devices, noise.tolist(), strict=True)),
         np.where(observations.seen, system.lengths, np.nan),
         converged,
@@ -259,11 +262,3 @@ def scale_errors(problem: Problem, estimate: Estimate) -> Array:
         larger = dict(zip(MOTION[3:], shift, strict=True))
         by_parameter += [larger.get(name, 0.0) for name in problem.free.get(device, ())]
     return np.array(by_parameter) * problem.tolerances.scale_sigma(problem.observations.points)
-
-
-def _outliers(lengths: Array, observations: Observations) -> Mask:
-    """Sightings far off : (p, n, d). The projector's is one where camera 1's is: it was read there."""
-    outliers = lengths > OUTLIER
-    if PROJECTOR in observations.devices[1:]:
-        outliers[:, :, observations.devices.index(PROJECTOR)] |= outliers[:, :, 0]
-    return outliers

@@ -1,5 +1,6 @@
 """Joint optics calibration: from sightings of a board's points to the devices' parameters and their covariance."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -154,7 +155,8 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     """`calibrate`, with sightings of enough points."""
     dropped = {f"{sighting.name} {device}": str(reason) for sighting in sightings for device, reason in sighting.failures.items()}
     if not any(sighting.pixels for sighting in sightings):
-        raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {_commonest(dropped)}")
+        commonest = Counter(dropped.values()).most_common(1)[0][0] if dropped else "no images"
+        raise InputError(f"{name}: expected the board in {len(sightings)} poses, found it in none: {commonest}")
     observations = gather(sightings, board, sizes)
     checks.refuse_unusable(observations, name)
     turn = half_turns.half_turn(board)
@@ -176,12 +178,14 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
         flipped |= {"all devices": others} if others else {}
         offsets = circle_offsets(observations, estimate, board)
     tolerances = settings.shape.tolerances
-    estimate, tolerances = _shaped(observations, estimate, free, offsets, settings.shape) if released else (estimate, tolerances)
+    if released:  # the board's shape, first held by wide tolerances, shows its own
+        wide = adjust(observations, estimate, free, offsets, board_shape.WIDE, released)
+        estimate, tolerances = wide.estimate, _tolerances(wide, settings.shape)
     estimate = adjust(observations, estimate, free, offsets, tolerances, released).estimate
     offsets = circle_offsets(observations, estimate, board)
     model, scores = _models(observations, estimate, offsets, settings)
     free = _free(observations, model)
-    bare = _without_distortion(estimate)
+    bare = replace(estimate, cameras={name: replace(each, distortion=np.zeros(0)) for name, each in estimate.cameras.items()})
     adjusted = adjust(observations, bare, free, offsets, tolerances, released)
     offsets = circle_offsets(observations, adjusted.estimate, board)
     if released:
@@ -207,18 +211,10 @@ def _determine_shape(observations: Observations) -> bool:
     return bool(points <= MANY_POINTS and 2 * np.count_nonzero(observations.used) > ENOUGH * unknowns)
 
 
-def _shaped(
-    observations: Observations, start: Estimate, free: Mapping[str, Sequence[str]], offsets: Array, shape: Shape
-) -> tuple[Estimate, Tolerances]:
-    """The board's shape, first held by wide tolerances, and the tolerances that it shows."""
-    adjusted = adjust(observations, start, free, offsets, board_shape.WIDE, released=True)
-    return adjusted.estimate, _tolerances(adjusted, shape)
-
-
 def _tolerances(adjusted: Adjustment, shape: Shape) -> Tolerances:
     """Tolerances of the board by the evidence of the sightings."""
     information, pull = board_information(adjusted)
-    return board_shape.estimated(information, pull, adjusted.problem.observations.points, shape.tolerances)
+    return board_shape.estimate(information, pull, adjusted.problem.observations.points, shape.tolerances)
 
 
 def _lenses(adjusted: Adjustment) -> Array:
@@ -226,7 +222,7 @@ def _lenses(adjusted: Adjustment) -> Array:
     lenses, held = adjusted.lenses.copy(), np.isfinite(adjusted.lenses)
     if held.any():
         most = lens_sigmas(replace(adjusted.problem, lenses=None, tightness={}), adjusted.calibration.cameras)
-        lenses[held] = usual_lenses.estimated(*lens_information(adjusted), lenses[held], most[held])
+        lenses[held] = usual_lenses.estimate(*lens_information(adjusted), lenses[held], most[held])
     return lenses
 
 
@@ -312,7 +308,8 @@ def _consistent(
     while True:
         offsets = circle_offsets(observations, estimate, board)
         adjusted = adjust(observations, estimate, free, offsets)
-        misfit = np.nan_to_num(np.nanmedian(_filled(adjusted.normalised), axis=1))  # (p, d)
+        nothing = ~np.isfinite(adjusted.normalised).any(axis=1, keepdims=True)  # of a pose that a device doesn't see
+        misfit = np.nan_to_num(np.nanmedian(np.where(nothing, 0.0, adjusted.normalised), axis=1))  # (p, d)
         worst, device = np.unravel_index(int(np.argmax(misfit)), misfit.shape)
         if misfit[worst, device] < BAD_POSE:
             return adjusted, observations, dropped
@@ -330,12 +327,6 @@ def _consistent(
         estimate = Estimate(adjusted.calibration.cameras, adjusted.poses[rest], adjusted.points)
 
 
-def _filled(lengths: Array) -> Array:
-    """Residuals with a zero for each pose and device without any, so that a median exists."""
-    nothing = ~np.isfinite(lengths).any(axis=1, keepdims=True)
-    return np.where(nothing, 0.0, lengths)
-
-
 def _models(
     observations: Observations, estimate: Estimate, offsets: Array, settings: Settings
 ) -> tuple[dict[str, ModelName], dict[str, dict[ModelName, float]]]:
@@ -346,24 +337,8 @@ def _models(
     return {device: model for device, (model, _) in chosen.items()}, {device: scores for device, (_, scores) in chosen.items()}
 
 
-def _without_distortion(estimate: Estimate) -> Estimate:
-    cameras = {device: replace(camera, distortion=np.zeros(0)) for device, camera in estimate.cameras.items()}
-    return Estimate(cameras, estimate.poses, estimate.points)
-
-
 def departure(points: Array, design: Array) -> tuple[float, float]:
     """RMS distance of points : (n, 3) mm from their design, in the plane and out of it, mm, once laid on it."""
-    turn, shift = _laid(points, design)
-    left = points @ turn.T + shift - design
+    flat, placed = design - design.mean(axis=0), points - points.mean(axis=0)
+    left = Rotation.align_vectors(flat, placed)[0].apply(placed) - flat  # laid on it: Kabsch
     return float(np.sqrt(np.mean(np.sum(left[:, :2] ** 2, axis=1)))), float(np.sqrt(np.mean(left[:, 2] ** 2)))
-
-
-def _laid(points: Array, design: Array) -> tuple[Array, Array]:
-    """Rotation and shift that lay points on their design (Kabsch)."""
-    turn = Rotation.align_vectors(design - design.mean(axis=0), points - points.mean(axis=0))[0].as_matrix()
-    return turn, design.mean(axis=0) - turn @ points.mean(axis=0)
-
-
-def _commonest(reasons: Mapping[str, str]) -> str:
-    values = list(reasons.values())
-    return max(set(values), key=values.count) if values else "no images"

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
-from recon.model.probe import ProbeCalibration
+from recon.model.probe import NAMES, ProbeCalibration
 from recon.model.rig import Probe
 from recon.probe_calibration import crossing_frames, movement, point_calibration, probe_checks, repeatability, sound_in_water
 from recon.probe_calibration.crossing_frames import CrossingFrames
@@ -80,7 +80,7 @@ def compare(calibration: ProbeCalibration, earlier: ProbeCalibration) -> Metrics
 def _of_pose(calibration: ProbeCalibration) -> NDArray[np.float64]:
     """Covariance : (6, 6) of the turn and the shift; zero if there is none."""
     known = calibration.uncertainty
-    return np.zeros((6, 6)) if known is None else known.ordered(point_calibration.NAMES)[2:, 2:]
+    return np.zeros((6, 6)) if known is None else known.ordered(NAMES)[2:, 2:]
 
 
 def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:

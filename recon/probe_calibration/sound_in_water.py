@@ -16,6 +16,7 @@ from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike, NDArray
 
 from recon.errors import InputError
+from recon.estimation.covariance import propagate
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import SCANNER_SPEED, ProbeCalibration, speed_fault
@@ -97,7 +98,7 @@ def in_medium(calibration: ProbeCalibration, calibrated: float, speed: float, ra
     uncertainty = calibration.uncertainty
     if uncertainty is not None:
         jacobian, by_ratio = _jacobian(uncertainty.names, depth, sy, ratio, face_row)
-        covariance = jacobian @ uncertainty.covariance @ jacobian.T + ratio_sigma**2 * np.outer(by_ratio, by_ratio)
+        covariance = propagate(jacobian, uncertainty.covariance) + ratio_sigma**2 * np.outer(by_ratio, by_ratio)
         uncertainty = Uncertainty(uncertainty.names, covariance)
     turn = calibration.target_from_image[:3, :3]
     return ProbeCalibration(rigid.transform(turn, origin), np.array([sx, sy * ratio]), uncertainty, speed, face_row)

@@ -231,6 +231,6 @@ def _tangents(normal: Array) -> Array:
 
 
 def displacements(motion: Array, probe: ProbeCalibration, pixels: Array) -> Array:
-    """By which pixels : (k, 2) of the B-scan lie elsewhere where the probe has moved by a motion : (6,), as (k, 3) mm."""
+    """Displacement : (k, 3) mm of pixels : (k, 2) of the B-scan caused by a motion : (6,) of the probe."""
     moved = ProbeCalibration(rigid.moved(probe.target_from_image, motion), probe.scale)
     return moved.to_target(pixels) - probe.to_target(pixels)

@@ -102,20 +102,12 @@ def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
         if len(found) == MOST_NAMED or not beyond:
             return found | {name: test.finding for name, test in tests.items()}
         best = max(beyond, key=lambda name: tests[name].evidence)
-        rivals = tuple(name for name in tests if name != best and _as_likely(tests[name], tests[best]))
+        least, fit = tests[best].evidence - RIVAL, tests[best].statistic - 2 * RIVAL
+        rivals = tuple(name for name, one in tests.items() if name != best and one.evidence > least and one.statistic > fit)
         found[best] = replace(tests[best].finding, named=True, rivals=rivals)
-        equations = _beside(equations, best)
-
-
-def _as_likely(test: _Test, best: _Test) -> bool:
-    return test.evidence > best.evidence - RIVAL and test.statistic > best.statistic - 2 * RIVAL
-
-
-def _beside(equations: Equations, name: str) -> Equations:
-    """Equations in which a part's motion is uncertain, and not tested any more."""
-    fault = equations.faults[name]
-    others = {other: each for other, each in equations.faults.items() if other != name}
-    return Equations(equations.residuals, np.column_stack([equations.spread, fault.slopes * (10 * fault.usual)]), others)
+        motion = equations.faults[best].slopes * (10 * equations.faults[best].usual)  # uncertain, and not tested any more
+        others = {name: fault for name, fault in equations.faults.items() if name != best}
+        equations = Equations(equations.residuals, np.column_stack([equations.spread, motion]), others)
 
 
 def _tested(equations: Equations, fault: Fault) -> _Test:
@@ -142,6 +134,6 @@ def as_sigma(statistic: float, freedom: int) -> float:
     return float(stats.norm.isf(np.exp(chance) / 2)) if chance > SMALLEST else float(np.sqrt(statistic))
 
 
-def named(findings: Mapping[str, Finding]) -> Sequence[str]:
-    """Parts that are told to have moved, with those that may have instead."""
+def moved_parts(findings: Mapping[str, Finding]) -> Sequence[str]:
+    """Names of moved parts and their rivals."""
     return list(dict.fromkeys(one for name, each in findings.items() if each.named for one in (name, *each.rivals)))

@@ -58,16 +58,16 @@ class Matches(NamedTuple):
         return Matches(first, *others, axes=self.axes)
 
 
-class Rows(NamedTuple):
+class DeviceRows(NamedTuple):
     """Equations free of poses and points."""
 
     residuals: Array  # (m,)
     by_optics: Array  # (m, g) by the calibration's parameters and all motions
     by_length: Array  # (m, 2 n - 3) by the target's lengths, mm
 
-    def over(self, factor: float) -> "Rows":
+    def over(self, factor: float) -> "DeviceRows":
         """The same with noise that is larger by a factor."""
-        return Rows(*(each / factor for each in self))
+        return DeviceRows(*(each / factor for each in self))
 
 
 def parameters(known: Uncertainty, devices: Sequence[str]) -> tuple[str, ...]:
@@ -76,12 +76,12 @@ def parameters(known: Uncertainty, devices: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*known.names, *motions)))
 
 
-def of_film(pairs: Sequence[tuple[Sighting, Sighting]], target: Target, names: Sequence[str]) -> Rows:
+def of_film(pairs: Sequence[tuple[Sighting, Sighting]], target: Target, names: Sequence[str]) -> DeviceRows:
     """Equations of n pairs of frames that show all circles in both views: of n circles 4 n - 6 each."""
     rows = [_of_pair(pair, target, names) for pair in pairs]
     free = eliminate(*(np.stack(each) for each in zip(*rows, strict=True)))
     by_length = free[..., 1 + len(names) :]
-    return Rows(
+    return DeviceRows(
         free[..., 0].ravel(), free[..., 1 : 1 + len(names)].reshape(-1, len(names)), by_length.reshape(-1, by_length.shape[-1])
     )
 
@@ -112,7 +112,7 @@ def _by_pose(pair: tuple[Sighting, Sighting], pose: Array, circles: Circles) -> 
     return np.concatenate(slopes).reshape(-1, 6), np.concatenate(missing).ravel()
 
 
-def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, names: Sequence[str]) -> Rows:
+def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, names: Sequence[str]) -> DeviceRows:
     """Equations of m points: one each with fringes along one axis of the projector, three with both."""
     axes, (m, k) = list(matches.axes), matches.first.shape
     points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
@@ -130,7 +130,7 @@ def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, 
     sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
     free = eliminate(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
     by_optics = free[..., 1:].reshape(-1, len(names))
-    return Rows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), len(target.LENGTHS))))
+    return DeviceRows(free[..., 0].ravel(), by_optics, np.zeros((len(by_optics), len(target.LENGTHS))))
 
 
 def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: Mapping[str, Camera]) -> Array:
@@ -144,17 +144,19 @@ def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: M
     return camera.centre + depth[:, None] * rays
 
 
-def assembled(film: Rows | None, fringes: Rows | None, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
+def assemble(
+    film: DeviceRows | None, fringes: DeviceRows | None, target: Target, known: Uncertainty, names: Sequence[str]
+) -> Equations:
     """All equations with their faults: a motion of each device, and a target of other lengths.
 
     Noise that is larger than predicted is taken as found, of film and fringes each by itself.
     """
     parts = [rows for rows in (film, fringes) if rows is not None]
     parts = [rows.over(fault_tests.noise_factor(_equations(rows, target, known, names))) for rows in parts]
-    return _equations(Rows(*map(np.concatenate, zip(*parts, strict=True))), target, known, names)
+    return _equations(DeviceRows(*map(np.concatenate, zip(*parts, strict=True))), target, known, names)
 
 
-def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
+def _equations(rows: DeviceRows, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:
     lengths = root(circle_layout.length_covariance(target))
     spread = np.column_stack([rows.by_optics @ root(known.ordered(names)), rows.by_length @ lengths])
     faults = {}
@@ -167,7 +169,7 @@ def _equations(rows: Rows, target: Target, known: Uncertainty, names: Sequence[s
     )
 
 
-def agreeing(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> Rows:
+def agreeing(rows: DeviceRows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> DeviceRows:
     """Groups of `each` equations that agree with most others, whatever has moved: edges and stray light are left out."""
     equations = _equations(rows, target, known, names)
     used = np.ones(len(rows.residuals) // each, bool)
@@ -175,11 +177,11 @@ def agreeing(rows: Rows, target: Target, known: Uncertainty, names: Sequence[str
         left = fault_tests.unexplained(equations, np.repeat(used, each))
         worst = np.abs(left.reshape(-1, each)).max(axis=1)
         used = worst < OUTLYING * max(NORMAL_MAD * float(np.median(np.abs(left))), 1e-12)
-    return Rows(*(part[np.repeat(used, each)] for part in rows))
+    return DeviceRows(*(part[np.repeat(used, each)] for part in rows))
 
 
 def displacements(device: str, motion: Array, calibration: Calibration, points: Array, axes: Sequence[int]) -> Array:
-    """By which points : (n, 3) mm are measured elsewhere where a device has moved by a motion : (6,), as (n, 3) mm.
+    """Displacement : (n, 3) mm of measured points : (n, 3) mm caused by a motion : (6,) of a device.
 
     Of a camera points that both cameras measure; of the projector those that camera 1 measures by its light.
     """

@@ -45,7 +45,7 @@ class Verdict(NamedTuple):
     part: str
     state: State
     sigma: float = np.nan  # as of `fault_tests.Finding`
-    mm: float = np.nan  # root mean square by which the working volume is measured elsewhere
+    mm: float = np.nan  # root mean square displacement of points measured in the working volume
     mm_sigma: float = np.nan  # standard deviation of that: smaller deviations aren't found
     motion: str = ""  # in words
     rivals: tuple[str, ...] = ()  # that explain all as well
@@ -70,7 +70,7 @@ def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target
         each = 2 * len(seen.matches.axes) - 1
         fringes = optics_equations.of_fringes(seen.matches, cameras, target, names)
         fringes = optics_equations.agreeing(fringes, target, known, names, each)
-    findings = fault_tests.find(optics_equations.assembled(film, fringes, target, known, names), alarm_sigma)
+    findings = fault_tests.find(optics_equations.assemble(film, fringes, target, known, names), alarm_sigma)
     axes = (0,) if seen.matches is None else seen.matches.axes
     points = np.concatenate([_film_points(seen), _lit_points(seen, cameras)])
     effects = {

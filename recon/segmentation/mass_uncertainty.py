@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.estimation.covariance import propagate
 from recon.freehand import place_uncertainty
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
@@ -123,7 +124,7 @@ def _by_placing(weights: Weights, shown: Shown, scans: Scans) -> Array:
     probe, errors = scans.probe, scans.errors
     assert probe is not None and probe.uncertainty is not None
     moved = _moved(weights, shown, place_uncertainty.probe_slopes(scans.world_from_pixel, probe)).sum(axis=0)
-    covariance = moved @ probe.uncertainty.ordered(NAMES) @ moved.T
+    covariance = propagate(moved, probe.uncertainty.ordered(NAMES))
     if errors is None:
         return covariance
     by_pose = _moved(weights, shown, place_uncertainty.pose_slopes(scans.world_from_pixel, probe))

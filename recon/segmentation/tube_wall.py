@@ -19,6 +19,7 @@ from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 
 from recon.errors import InputError
+from recon.estimation.covariance import propagate
 from recon.geometry import rigid
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.geometry.primitives import Cylinder, fit_cylinder
@@ -291,8 +292,7 @@ def _smooth_outline(angle: Array, radius: Array, extent: Array) -> tuple[Array, 
 
 
 def _turned(covariance: Array, world_from_pixel: Array) -> Array:
-    jacobian = world_from_pixel[:3, :2]
-    return jacobian @ covariance @ jacobian.T
+    return propagate(world_from_pixel[:3, :2], covariance)
 
 
 def _weigh(points: Array, covariance: Array, frames: NDArray[np.int64]) -> Tube:

@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from recon.errors import InputError
+from recon.estimation.covariance import propagate
 from recon.geometry import rigid
 from recon.geometry.surface_tree import surface_tree
 
@@ -53,7 +54,7 @@ class SkinShift:
     def sigma_mm(self, point: ArrayLike) -> float:
         """Standard deviation of the place to which a point : (3,) mm is moved, along the direction where it is largest."""
         slopes = rigid.slopes(rigid.rotate(self.new_from_old, point))
-        return float(np.sqrt(np.linalg.eigvalsh(slopes @ self.covariance @ slopes.T)[-1]))
+        return float(np.sqrt(np.linalg.eigvalsh(propagate(slopes, self.covariance))[-1]))
 
 
 def register(old: trimesh.Trimesh, new: trimesh.Trimesh) -> SkinShift:

@@ -150,16 +150,11 @@ def adjust(pairs: Sequence[Seen], design: Target, optics: Uncertainty | None) ->
     covariance[DIAMETER, DIAMETER] += (RIM_BIAS * design.outer_diameter_mm) ** 2
     parts = _split(_residuals(pairs, devices, unknowns)[used])
     centres, shapes = (float(np.sqrt(np.mean(part**2))) for part in parts)
-    target = _measured_target(unknowns.target, covariance, design)
+    *lengths, diameter, xx, xy, yy = unknowns.target.tolist()
+    kept = tuple(tuple(row) for row in covariance[:DIAMETER, :DIAMETER].tolist())
+    update = {"outer_diameter_mm": diameter, "curvature_per_m": (xx, xy, yy), "covariance_mm2": kept}
+    target = circle_layout.with_lengths(design, np.array(lengths)).model_copy(update=update)
     return Adjusted(target, covariance, noise, centres, shapes, used, tuple(pairs))
-
-
-def _measured_target(values: Array, covariance: Array, design: Target) -> Target:
-    """The design with the values : (p,) of its parameters, and the covariance : (p, p) of the lengths."""
-    *lengths, diameter, xx, xy, yy = values.tolist()
-    known = tuple(tuple(row) for row in covariance[:DIAMETER, :DIAMETER].tolist())
-    update = {"outer_diameter_mm": diameter, "curvature_per_m": (xx, xy, yy), "covariance_mm2": known}
-    return circle_layout.with_lengths(design, np.array(lengths)).model_copy(update=update)
 
 
 def _devices(cameras: Sequence[Camera], optics: Uncertainty | None) -> _Devices:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.geometry.camera import Camera
-from recon.geometry.usual_lenses import LARGEST, SMALLER, coefficients, corner_radius, estimated, largest
+from recon.geometry.usual_lenses import LARGEST, SMALLER, coefficients, corner_radius, estimate, largest
 
 NAMES = ("fx", "k1", "k2", "p1", "tx")
 
@@ -35,20 +35,20 @@ def test_what_points_determine_is_not_held(camera):
     """However exactly: shrunk by a thousandth of its value at most."""
     most = largest(camera, NAMES)[1:4]
     for sigma in (1e-3 * most, 1e-10 * most):
-        held = estimated(*shown(0.1 * most, sigma), most, most)
+        held = estimate(*shown(0.1 * most, sigma), most, most)
         assert (sigma**2 / held**2 < 1e-3).all() and np.isfinite(held).all()
 
 
 def test_what_points_show_to_be_small_is_nearly_zero(camera):
     most = largest(camera, NAMES)[1:4]
     sigma = 1e-2 * most
-    held = estimated(*shown(0.3 * sigma, sigma), most, most)
+    held = estimate(*shown(0.3 * sigma, sigma), most, most)
     assert (held < 0.7 * sigma).all()
 
 
 def test_of_what_points_do_not_show_the_scatter_among_lenses_is_left(camera):
     most = largest(camera, NAMES)[1:4]
-    held = estimated(*shown(np.zeros(3), 1e4 * most), most, most)
+    held = estimate(*shown(np.zeros(3), 1e4 * most), most, most)
     np.testing.assert_allclose(held, np.sqrt(np.mean(SMALLER**2)) * most, rtol=1e-3)
 
 
@@ -61,7 +61,7 @@ def test_errors_are_as_large_as_they_seem(rng):
     for _ in range(1000):
         true, sigma = rng.choice(SMALLER, 3) * rng.standard_normal(3), 10 ** rng.uniform(-4, 1, 3)
         seen = true + sigma * rng.standard_normal(3)
-        held = estimated(*shown(seen, sigma), most, most)
+        held = estimate(*shown(seen, sigma), most, most)
         variance = 1 / (sigma**-2 + held**-2)
         inside.append(np.abs(variance * seen / sigma**2 - true) < 2 * np.sqrt(variance))
     assert 0.88 < np.mean(inside) < 0.97

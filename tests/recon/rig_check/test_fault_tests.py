@@ -34,7 +34,7 @@ def test_alarms_are_as_seldom_as_they_claim(equations, rng):
 def test_what_moved_is_named_and_its_motion_found(equations, rng, part):
     """By the motion's own covariance, to five standard deviations; the other part stays as it is."""
     found = fault_tests.find(measured(equations, rng, (5.0, -4.0), part), 3.5)
-    assert fault_tests.named(found) == [part] and found[part].sigma > 10
+    assert fault_tests.moved_parts(found) == [part] and found[part].sigma > 10
     off = found[part].motion[:2] - [5.0, -4.0]
     assert (np.abs(off) < 5 * np.sqrt(np.diag(found[part].covariance))[:2]).all()
 
@@ -42,14 +42,14 @@ def test_what_moved_is_named_and_its_motion_found(equations, rng, part):
 def test_two_that_moved_are_both_named(equations, rng):
     once = measured(equations, rng, (6.0, -6.0), "first")
     both = Equations(once.residuals + equations.faults["second"].slopes @ [6.0, 6.0], once.spread, once.faults)
-    assert set(fault_tests.named(fault_tests.find(both, 3.5))) == {"first", "second"}
+    assert set(fault_tests.moved_parts(fault_tests.find(both, 3.5))) == {"first", "second"}
 
 
 def test_parts_that_explain_the_same_are_rivals(equations, rng):
     """A part with the same slopes can't be told from the first."""
     moved = measured(equations, rng, (5.0, 5.0))
     twins = Equations(moved.residuals, moved.spread, {**moved.faults, "twin": moved.faults["first"]})
-    assert set(fault_tests.named(fault_tests.find(twins, 3.5))) == {"first", "twin"}
+    assert set(fault_tests.moved_parts(fault_tests.find(twins, 3.5))) == {"first", "twin"}
 
 
 def test_a_part_that_explains_nothing_is_neither_named_nor_a_rival(equations, rng):
@@ -59,7 +59,7 @@ def test_a_part_that_explains_nothing_is_neither_named_nor_a_rival(equations, rn
         "second": Fault(equations.faults["second"].slopes, np.full(2, 0.01)),
     }
     found = fault_tests.find(measured(Equations(equations.residuals, equations.spread, faults), rng, (1.5,)), 3.5)
-    assert fault_tests.named(found) == ["first"] and found["second"].sigma < 3
+    assert fault_tests.moved_parts(found) == ["first"] and found["second"].sigma < 3
 
 
 def test_a_part_that_nothing_shows_is_left_out(equations, rng):
