@@ -6,36 +6,21 @@ from time import perf_counter
 import cv2
 import numpy as np
 
-from recon.capture.surface_part import read_patterns
-from recon.model.rig import Rig
 from recon.optical_calibration.joint_calibration import calibrate
 from recon.threads import mapped
-from sonotwin.config import compose, folder
 from twin.experiments import calibration_accuracy
 from twin.experiments.board_sets import BoardSet, rendered
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.sensor import Numbers
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [whole_calibration]
-
-
-def whole_calibration() -> list[Row]:
-    """Row h: images in memory to calibration. The peer calibrates the two cameras only; the projector it leaves to others."""
-    rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
-    setup = Setup(rig, {"paper_calibration": read_patterns(folder() / "patterns" / "paper_calibration.yaml")})
+def whole_calibration(setup: Setup) -> Figures:
+    """Images in memory to calibration. The peer calibrates the two cameras only; the projector it leaves to others."""
     seen = rendered(calibration_accuracy.session(setup))
     adjusting = seconds(lambda: calibrate(seen.sightings, seen.board, seen.sizes))
     finding, pair = opencv_pair(seen)
-    what = f"{len(seen.sightings)} poses, 52 images 1280x1024 each"
-    together = seen.seconds + adjusting
-    return [
-        Row("h", f"{what}: three devices, all together (peer: two cameras, OpenCV)", together, 20, finding + pair, "s"),
-        Row("h", f"{what}: of that, find the board and decode the fringes", seen.seconds, 16, finding, "s"),
-        Row("h", f"{what}: of that, choose the lens models and adjust", adjusting, 4, pair, "s"),
-    ]
+    ours = {"together_s": seen.seconds + adjusting, "finding_s": seen.seconds, "adjusting_s": adjusting}
+    return ours | {"poses": len(seen.sightings), "peer_s": finding + pair, "peer_finding_s": finding, "peer_adjusting_s": pair}
 
 
 def opencv_pair(seen: BoardSet) -> tuple[float, float]:

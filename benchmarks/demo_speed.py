@@ -10,27 +10,16 @@ from time import perf_counter
 from recon.files import metrics
 from recon.files.metrics import Metrics
 from sonotwin.demonstration import RESULT
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [whole]
-
-
-def whole() -> list[Row]:
-    """The budgets of `make demo`, and its longest step: the calibration board, which is rendered once and kept."""
+def whole(setup: Setup) -> Figures:
+    """Seconds of `make demo`, and of its longest step: the calibration board, which is rendered once and kept."""
     with TemporaryDirectory() as folder:
         caches = {"SONOTWIN_CACHE": folder, "HOME": folder}  # DrJit keeps its own at home
         fresh, _ = demonstration(Path(folder) / "first", caches)
         compiled, figures = demonstration(Path(folder) / "second", caches)
-    name = "board, surface and filmed sweeps, rendered, measured and compared"
-    return [
-        Row("demo", f"{name}, nothing compiled before", fresh, 300, None, "s"),
-        Row("demo", name, compiled, 210, None, "s"),
-        Row("demo", "of that, the board rendered in 10 poses", figures["seconds_board"], 45, None, "s"),
-        Row("demo", "of that, found and decoded in them", figures["seconds_detect"], 12, None, "s"),
-    ]
+    return {"fresh_s": fresh, "compiled_s": compiled, "board_s": figures["seconds_board"], "detect_s": figures["seconds_detect"]}
 
 
 def demonstration(out: Path, environment: dict[str, str]) -> tuple[float, Metrics]:

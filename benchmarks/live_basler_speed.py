@@ -24,7 +24,7 @@ from recon.devices.basler import BaslerSettings, open_camera
 from recon.devices.camera_pairs import CameraPair, Pair
 from recon.devices.interfaces import Image
 from twin.devices.virtual_session import OneTake
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 PAIRS = 1000
 SIZE = (1280, 1024)
@@ -32,35 +32,21 @@ SERIALS = ("0815-0000", "0815-0001")  # of the emulator's first cameras
 HELD = 256  # frames; where the cores limit the rate, one emulated camera runs ahead of the other by some
 RECORDED_HZ = 25.0  # as fast as the tracker follows on two cores
 SERVED = (7, 11)  # images that each camera serves in turn: frames of different pairs differ in their hashes
-WHAT = f"{PAIRS} pairs 1280x1024 of two emulated Basler cameras"
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    os.environ["PYLON_CAMEMU"] = "2"  # before pylon is loaded
-    return [free_running, software_trigger, recorded]
-
-
-def free_running() -> list[Row]:
-    """Row a: both cameras at the emulator's rate, beside pylon's bare loop."""
+def free_running(setup: Setup) -> Figures:
+    """Both cameras at the emulator's rate, beside pylon's bare loop."""
     with served() as (settings, hashes):
         bare = bare_rate(settings)
         rate, lost, wrong = taken(settings, hashes, "free")
-    return [
-        Row("a", f"{WHAT}, free-running: frames lost", lost, 0, None, ""),
-        Row("a", f"{WHAT}, free-running: frames with another hash than that served", wrong, 0, None, ""),
-        Row("a", f"{WHAT}, free-running (peer: pylon's own loop, hashes too)", rate, 0.7 * bare, bare, "pairs/s", True),
-    ]
+    return {"pairs": PAIRS, "lost": lost, "wrong": wrong, "rate_hz": rate, "bare_hz": bare}
 
 
-def software_trigger() -> list[Row]:
-    """Row a: both cameras triggered by a call, each time after the pair before."""
+def software_trigger(setup: Setup) -> Figures:
+    """Both cameras triggered by a call, each time after the pair before."""
     with served() as (settings, hashes):
         rate, lost, wrong = taken(settings, hashes, "software")
-    return [
-        Row("a", f"{WHAT}, software trigger: frames lost, or with another hash", lost + wrong, 0, None, ""),
-        Row("a", f"{WHAT}, software trigger, 10 ms exposure", rate, None, None, "pairs/s"),
-    ]
+    return {"pairs": PAIRS, "lost_or_wrong": lost + wrong, "rate_hz": rate}
 
 
 class CountedPairs(CameraPair):
@@ -80,8 +66,8 @@ class CountedPairs(CameraPair):
         return self.given >= PAIRS
 
 
-def recorded() -> list[Row]:
-    """Row a: both cameras at a rate of their own into a capture, whose images are read again."""
+def recorded(setup: Setup) -> Figures:
+    """Both cameras at a rate of their own into a capture, whose images are read again."""
     said, plan = list[str](), SweepPlan("scan", None, ("free", "free"), None, 10.0, Limits())
     with served() as (settings, hashes), tempfile.TemporaryDirectory() as folder:
         cameras = [open_camera(name, SERIALS[k], replace(settings[k], rate_hz=RECORDED_HZ)) for k, name in enumerate(CAMERAS)]
@@ -98,17 +84,14 @@ def recorded() -> list[Row]:
             lost += numbers[-1] + 1 - len(numbers)
             for k in numbers:
                 wrong += digest(read_image(place / image_name(k), SIZE, 8)) != own[k % len(own)]
-    what = f"{counts[CAMERAS[0]]} pairs 1280x1024 at {RECORDED_HZ:g} a second into a capture"
-    return [
-        Row("a", f"{what}: frames lost", lost + sum(line.startswith("lost") for line in said), 0, None, ""),
-        Row("a", f"{what}: images on the disk with another hash than that served", wrong, 0, None, ""),
-        Row("a", f"{what}: rate", rate, None, RECORDED_HZ, "pairs/s"),
-    ]
+    lost += sum(line.startswith("lost") for line in said)
+    return {"pairs": counts[CAMERAS[0]], "asked_hz": RECORDED_HZ, "lost": lost, "wrong": wrong, "rate_hz": rate}
 
 
 @contextmanager
 def served() -> Iterator[tuple[list[BaslerSettings], list[list[str]]]]:
     """Settings of two cameras that serve images of noise from folders, and the images' hashes."""
+    os.environ["PYLON_CAMEMU"] = "2"  # before pylon is loaded
     rng = np.random.default_rng(1)
     with tempfile.TemporaryDirectory() as folder:
         settings, hashes = [], []

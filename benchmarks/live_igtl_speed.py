@@ -16,17 +16,12 @@ from recon.devices.openigtlink.igtl_client import Client
 from recon.devices.openigtlink.igtl_image import Image
 from recon.devices.openigtlink.igtl_messages import Message, Transform
 from recon.devices.openigtlink.igtl_server import LOOPBACK, Server
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 DRAWS = 50  # transforms and images each way
 WAIT_S = 10.0
 SOAK_S, RATE_HZ = 60.0, 20.0
 SHAPE = (480, 640)  # of a B-scan
-
-
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [to_pyigtl, from_pyigtl, times, soak]
 
 
 def drawn(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int]:
@@ -42,8 +37,8 @@ def off(found: np.ndarray, pose: np.ndarray) -> float:
     return float((np.abs(found - pose) / np.maximum(np.abs(pose), 1)).max())
 
 
-def to_pyigtl() -> list[Row]:
-    """Row c: our server to pyigtl's client, headers of both versions in turn."""
+def to_pyigtl(setup: Setup) -> Figures:
+    """Our server to pyigtl's client, headers of both versions in turn."""
     import pyigtl
 
     rng, errors, wrong, late = np.random.default_rng(1), list[float](), 0, list[float]()
@@ -60,7 +55,7 @@ def to_pyigtl() -> list[Row]:
             wrong += not np.array_equal(image.image[0], levels)
         client.stop()
         server.close()
-    return rows("our server to pyigtl's client", errors, wrong, late)
+    return agreement(errors, wrong, late)
 
 
 def wait(client: Any, name: str) -> Any:
@@ -68,8 +63,8 @@ def wait(client: Any, name: str) -> Any:
     return client.wait_for_message(name, WAIT_S)
 
 
-def from_pyigtl() -> list[Row]:
-    """Row c: pyigtl's server to our client."""
+def from_pyigtl(setup: Setup) -> Figures:
+    """pyigtl's server to our client."""
     import pyigtl
 
     rng, errors, wrong, late = np.random.default_rng(2), list[float](), 0, list[float]()
@@ -90,7 +85,7 @@ def from_pyigtl() -> list[Row]:
                 else:
                     wrong += not (isinstance(content, Image) and np.array_equal(content.levels, levels))
         client.close()
-    return rows("pyigtl's server to our client", errors, wrong, late)
+    return agreement(errors, wrong, late)
 
 
 @contextmanager
@@ -106,17 +101,13 @@ def pyigtl_server() -> Iterator[Any]:
         signal.signal(number, handler)
 
 
-def rows(way: str, errors: list[float], wrong: int, late: list[float]) -> list[Row]:
-    """Figures of one way."""
-    return [
-        Row("c", f"{way}: largest error of a transform's numbers, by their size", max(errors), 1e-6, 6e-8, ""),
-        Row("c", f"{way}: images of {len(errors)} that differ in a byte", wrong, 0, 0, ""),
-        Row("c", f"{way}: largest error of a time stamp", 1e6 * max(late), 1, 0.24, "us"),  # a double of seconds since 1970
-    ]
+def agreement(errors: list[float], wrong: int, late: list[float]) -> Figures:
+    """Figures of one way; times are doubles of seconds since 1970."""
+    return {"transform": max(errors), "images": len(errors), "wrong": wrong, "late_us": 1e6 * max(late)}
 
 
-def times() -> list[Row]:
-    """Row c: publishing beside a client that takes nothing, and the time to a client that does."""
+def times(setup: Setup) -> Figures:
+    """Publishing beside a client that takes nothing, and the time to a client that does."""
     server = Server(port=0)
     stalled = socket.create_connection((LOOPBACK, server.port))
     client = Client(port=server.port)
@@ -127,21 +118,16 @@ def times() -> list[Row]:
     for _ in range(200):
         start = perf_counter()
         server.publish(Message("Image", Image(levels, np.eye(4))))
-        took.append(perf_counter() - start)
+        took.append(1e3 * (perf_counter() - start))
         received = client.receive(WAIT_S)
         assert received is not None
-        late.append(perf_counter() - start)
+        late.append(1e3 * (perf_counter() - start))
         time.sleep(0.01)
     stalled.close()
     client.close()
     server.close()
-    name = f"B-scan of {SHAPE[1]}x{SHAPE[0]} px"
-    return [
-        Row("c", f"{name}: publish beside a client that takes nothing, median", 1e3 * float(np.median(took)), 5, None, "ms"),
-        Row("c", f"{name}: from publishing to the client, median", 1e3 * float(np.median(late)), 10, None, "ms"),
-        Row("c", f"{name}: from publishing to the client, 99 %", 1e3 * float(np.quantile(late, 0.99)), None, None, "ms"),
-        Row("c", f"{name}: write, median", written_ms(levels), None, None, "ms"),
-    ]
+    figures = {"width": SHAPE[1], "height": SHAPE[0], "write_ms": written_ms(levels), "publish_ms": np.median(took)}
+    return figures | {"late_ms": np.median(late), "latest_ms": np.quantile(late, 0.99)}
 
 
 def written_ms(levels: np.ndarray) -> float:
@@ -154,11 +140,8 @@ def written_ms(levels: np.ndarray) -> float:
     return 1e3 * float(np.median(took))
 
 
-def soak() -> list[Row]:
-    """Row c: a minute; half an hour is `python -m benchmarks.live_igtl_soak`."""
+def soak(setup: Setup) -> Figures:
+    """A minute; half an hour is `python -m benchmarks.live_igtl_soak`."""
     found = live_igtl_soak.run(SOAK_S, RATE_HZ)
-    what = f"{SOAK_S:.0f} s at {RATE_HZ:.0f} Hz, with slow and bad clients"
-    return [
-        Row("c", f"{what}: growth of memory", found.growth_mb, live_igtl_soak.MOST_MB, None, "MB"),
-        Row("c", f"{what}: threads at the end", found.tenth(9)[2], found.tenth(1)[2] + live_igtl_soak.MOST_MORE, None, ""),
-    ]
+    threads = {"threads": found.tenth(9)[2], "most_threads": found.tenth(1)[2] + live_igtl_soak.MOST_MORE}
+    return threads | {"growth_mb": found.growth_mb, "most_mb": live_igtl_soak.MOST_MB, "soak_s": SOAK_S, "soak_hz": RATE_HZ}

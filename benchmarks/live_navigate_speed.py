@@ -18,7 +18,7 @@ from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.slicer_publisher import SlicerPublisher
 from sonotwin.config import load
 from sonotwin.verbs import navigate, sweep
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 LAG_S, RATE_HZ = 0.05, 25  # of the sweep as it is rendered; of cameras and scanner
 FIRST_S, COUNTED_S = 12.0, 12.0  # of which the first are left out: the images are read, and latencies go ten seconds back
@@ -31,11 +31,6 @@ with connect(sys.argv[1], subprotocols=["viser-v" + viser.__version__], max_size
     for message in page:
         pass
 """
-
-
-def measurements() -> list[Measurement]:
-    """The rows of live navigation."""
-    return [navigated]
 
 
 class Sink:
@@ -52,8 +47,8 @@ class Sink:
     def close(self): ...
 
 
-def navigated() -> list[Row]:
-    """Row e: a stroke over the breast, round and round, with skin and three masses."""
+def navigated(setup: Setup) -> Figures:
+    """A stroke over the breast, round and round, with skin and three masses."""
     with tempfile.TemporaryDirectory() as folder:
         capture = recorded(Path(folder))
         config = load("navigate", [f"capture={capture}", f"lag_s={LAG_S}"], navigate.Config)
@@ -80,13 +75,8 @@ def navigated() -> list[Row]:
     late, scans = (each.figures() for each in (navigator.outlets[1].latencies, navigator.outlets[1].scans))
     if late is None or scans is None:
         raise RuntimeError("expected moments with B-scans in place, found none")
-    return [
-        Row("e", f"moments with a new B-scan in place on the page, of {RATE_HZ} a second", scans.rate_hz, 20, RATE_HZ,
-            "1/s", at_least=True),
-        Row("e", "exposure to published pose, median", late.median_ms, 60, playback.DELIVERY_NS * 1e-6, "ms"),
-        Row("e", "exposure to published pose, 99 %", late.high_ms, 120, playback.DELIVERY_NS * 1e-6, "ms"),
-        Row("e", "cores in use by all of it, playback included", used, 2, None, "cores"),
-    ]  # fmt: skip
+    latency = {"late_ms": late.median_ms, "latest_ms": late.high_ms, "delivery_ms": playback.DELIVERY_NS * 1e-6}
+    return latency | {"scans_hz": scans.rate_hz, "cores": used}
 
 
 def recorded(folder: Path) -> Path:

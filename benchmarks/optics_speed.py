@@ -6,10 +6,8 @@ import drjit as dr
 import numpy as np
 
 from recon.model.patterns import CentreLine, Fringes, GrayCode, Patterns, Uniform
-from recon.model.rig import Rig
 from scenes.catalogue import build_scene
-from sonotwin.config import compose
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_pattern
@@ -20,11 +18,6 @@ SAMPLES = 64
 SIZE = (1280, 800)
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [one_pass_against_many]
-
-
 def sequence(count: int) -> Patterns:
     """A calibration-like sequence of `count` patterns: fringes, Gray code, and uniform images for the rest."""
     if count == 9:
@@ -33,9 +26,9 @@ def sequence(count: int) -> Patterns:
     return Patterns(projector_size=SIZE, unwrap="gray", parts=(*parts, *(Uniform() for _ in range(count - 26))))
 
 
-def one_pass_against_many() -> list[Row]:
-    """Row b: breast, 1280x1024, 64 samples/px. The peer has no lens and no distortion, ours has both."""
-    rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
+def one_pass_against_many(setup: Setup) -> Figures:
+    """Breast, 1280x1024, 64 samples/px. The peer has no lens and no distortion, ours has both."""
+    rig = setup.rig
     scene = build_scene({"kind": "breast"})
     world = build_world(scene)
 
@@ -60,12 +53,7 @@ def one_pass_against_many() -> list[Row]:
     for pattern in range(27):
         render_pattern(peer, light, pattern, SAMPLES, seed=pattern)
     many = perf_counter() - start
-    name = f"breast, 1280x1024, {SAMPLES} samples/px"
-    peer_seconds = {count: many / 27 * count for count in seconds}  # a render a pattern; 27 of them were timed
-    faster = f"{name}: 27 patterns in one pass, times faster than 27 Mitsuba renders"
-    growth = f"{name}: cost of N = 50 over that of N = 9, less than 50 / 9"
-    return [
-        Row("b", faster, many / seconds[27], 10, 1, "x", at_least=True),
-        Row("b", growth, seconds[50] / seconds[9], 50 / 9, 50 / 9, "x"),
-        *(Row("b", f"{name}: N = {count}", seconds[count], peer_seconds[count], peer_seconds[count], "s") for count in seconds),
-    ]
+    figures = {"samples": SAMPLES, "times_faster": many / seconds[27], "growth": seconds[50] / seconds[9], "most_growth": 50 / 9}
+    for count in seconds:
+        figures |= {f"seconds_{count}": seconds[count], f"peer_{count}": many / 27 * count}  # 27 of its renders were timed
+    return figures

@@ -9,23 +9,18 @@ from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 import psutil
 
 from twin.engine import Engine, results
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 WORKERS = 2
 LONG_S, LONG = 10.0, 12  # tasks of ten seconds
 SHORT = 10_000
-LOCAL, DASK = Engine(workers=WORKERS), Engine(name="dask", workers=WORKERS)
-
-
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [lambda: long_tasks("local", LOCAL), lambda: long_tasks("dask", DASK), lambda: short_tasks("local", LOCAL),
-            lambda: short_tasks("dask", DASK), lambda: killed("local", LOCAL), lambda: killed("dask", DASK)]  # fmt: skip
+Name = Literal["local", "dask"]
 
 
 def rest(k: int) -> int:
@@ -50,19 +45,15 @@ def rest_or_die(k: int, folder: str) -> int:
     return k
 
 
-def long_tasks(name: str, engine: Engine) -> list[Row]:
+def long_tasks(setup: Setup, engine: Name) -> Figures:
     """Time beyond the tasks' own, from the first result to the last: the start of the workers is apart."""
     moments = [time.perf_counter()]
-    for _ in results(engine, rest, ((k,) for k in range(LONG + WORKERS))):
+    for _ in results(Engine(name=engine, workers=WORKERS), rest, ((k,) for k in range(LONG + WORKERS))):
         moments.append(time.perf_counter())
-    over = 100 * ((moments[-1] - moments[WORKERS]) / (LONG / WORKERS * LONG_S) - 1)
-    peer = 100 * (_by_a_plain_pool() / (LONG / WORKERS * LONG_S) - 1) if engine is LOCAL else None
-    what = f"{name}: {LONG} tasks of {LONG_S:.0f} s, {WORKERS} workers"
-    start = moments[1] - moments[0] - LONG_S
-    return [
-        Row("f", f"{what}: time over the tasks' own (peer: a plain pool of processes)", over, 5.0, peer, "%"),
-        Row("f", f"{what}: start of the workers", start, None, None, "s"),
-    ]
+    own = LONG / WORKERS * LONG_S
+    figures = {"tasks": LONG, "workers": WORKERS, "over_percent": 100 * ((moments[-1] - moments[WORKERS]) / own - 1)}
+    peer = {"peer_percent": 100 * (_by_a_plain_pool() / own - 1)} if engine == "local" else {}
+    return figures | peer | {"start_s": moments[1] - moments[0] - LONG_S}
 
 
 def _by_a_plain_pool() -> float:
@@ -74,29 +65,24 @@ def _by_a_plain_pool() -> float:
         return time.perf_counter() - start
 
 
-def short_tasks(name: str, engine: Engine) -> list[Row]:
+def short_tasks(setup: Setup, engine: Name) -> Figures:
     """Rates of the tenths of many short tasks, and the growth of this process's memory."""
     process, moments, memory = psutil.Process(), [time.perf_counter()], []
-    for done, _ in zip(count(1), results(engine, square, _numbers()), strict=False):
+    for done, _ in zip(count(1), results(Engine(name=engine, workers=WORKERS), square, _numbers()), strict=False):
         if done % (SHORT // 10) == 0:
             moments.append(time.perf_counter())
             memory.append(process.memory_info().rss / 1e6)
     seconds = np.diff(moments)[1:]  # the first tenth has the workers' start in it
-    what = f"{name}: {SHORT} tasks that do nothing"
-    return [
-        Row("f", f"{what}: tasks a second", SHORT / 10 / float(np.median(seconds)), None, None, "1/s"),
-        Row("f", f"{what}: slowest tenth over the fastest", float(seconds.max() / seconds.min()), 1.5, 1.0, ""),
-        Row("f", f"{what}: growth of memory from the second tenth to the last", memory[-1] - memory[1], 50.0, 0.0, "MB"),
-    ]
+    rates = {"rate_hz": SHORT / 10 / np.median(seconds), "slowest": seconds.max() / seconds.min()}
+    return rates | {"tasks": SHORT, "growth_mb": memory[-1] - memory[1]}
 
 
 def _numbers() -> Iterator[tuple[int]]:
     return ((k,) for k in range(SHORT))
 
 
-def killed(name: str, engine: Engine) -> list[Row]:
+def killed(setup: Setup, engine: Name) -> Figures:
     """Tasks that are begun again because a worker is killed in the middle."""
     with TemporaryDirectory() as folder:
-        done = sorted(results(engine, rest_or_die, ((k, folder) for k in range(8))))
-    what = f"{name}: results of 8 tasks, a worker killed at one"
-    return [Row("f", what, float(done == list(range(8))), 1.0, 1.0, "", at_least=True)]
+        tasks = ((k, folder) for k in range(8))
+        return {"right": sorted(results(Engine(name=engine, workers=WORKERS), rest_or_die, tasks)) == list(range(8))}

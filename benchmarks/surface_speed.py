@@ -9,29 +9,20 @@ import numpy as np
 
 from benchmarks import plain_numpy
 from recon.capture.images import read_images, write_images
-from recon.capture.surface_part import read_patterns
-from recon.model.rig import Rig
 from recon.structured_light.decode import decode
 from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import PointMap, Triangulator
 from scenes.catalogue import build_scene
-from sonotwin.config import compose, folder
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.surface_accuracy import TRACING
-from twin.experiments.table_rows import Measurement, Row
 from twin.optics.surface_session import Shooting, calibration_of, shoot
 
 REPEATS = 15
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [nine_images, from_files]
-
-
-def nine_images() -> list[Row]:
-    """Row h: the paper's sequence of the breast, 1280x1024. Both have the calibrated camera's rays in a table."""
-    rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
-    patterns = read_patterns(folder() / "patterns" / "paper_surface.yaml")
+def nine_images(setup: Setup) -> Figures:
+    """The paper's sequence of the breast, 1280x1024. Both have the calibrated camera's rays in a table."""
+    rig, patterns = setup.rig, setup.sequences["paper_surface"]
     images = shoot(rig, build_scene({"kind": "breast"}), patterns, "cam1", TRACING, Shooting(), seed=1).images
     cameras = calibration_of(rig).cameras
     camera, projector = cameras["cam1"], cameras["projector"]
@@ -49,21 +40,13 @@ def nine_images() -> list[Row]:
     cleaning = median_ms(lambda: clean(points, camera, found.modulation))
     peer = median_ms(lambda: plain_numpy.reconstruct(images, patterns, rays, camera.centre, projector), repeats=3)
     together = decoding + triangulating
-    name = "breast, 9 images 1280x1024"
-    return [
-        Row("h", f"{name}: decode and triangulate, median", together, 150, peer, "ms"),
-        Row("h", f"{name}: of that, decode with noise and unwrapping", decoding, 110, None, "ms"),
-        Row("h", f"{name}: of that, triangulate with both distortions", triangulating, 40, None, "ms"),
-        Row("h", f"{name}: clean, after that", cleaning, 60, None, "ms"),
-        Row("h", f"{name}: times faster than NumPy and a flood fill", peer / together, 5, 1, "x", at_least=True),
-        Row("h", f"{name}: share of pixels where both agree to 0.01 px", agree, 0.99, 1, "", at_least=True),
-    ]
+    parts = {"decoding_ms": decoding, "triangulating_ms": triangulating, "cleaning_ms": cleaning, "agree": agree}
+    return parts | {"together_ms": together, "peer_ms": peer, "times_faster": peer / together}
 
 
-def from_files() -> list[Row]:
-    """Row h: the same as a user with one capture waits for it: images read, rays and all; the peer is the authors' way."""
-    rig = Rig.model_validate(compose("render", ["out=unused"])["rig"])
-    patterns = read_patterns(folder() / "patterns" / "paper_surface.yaml")
+def from_files(setup: Setup) -> Figures:
+    """The same as a user with one capture waits for it: images read, rays and all; the peer is the authors' way."""
+    rig, patterns = setup.rig, setup.sequences["paper_surface"]
     shot = shoot(rig, build_scene({"kind": "breast"}), patterns, "cam1", TRACING, Shooting(), seed=1)
     cameras = calibration_of(rig).cameras
     camera, projector = cameras["cam1"], cameras["projector"]
@@ -80,12 +63,7 @@ def from_files() -> list[Row]:
         apart = float(np.median(np.linalg.norm(points[mask] - theirs, axis=-1)))
         whole = median_ms(ours)
         peer = median_ms(lambda: plain_numpy.from_files(paths, patterns, mask, camera, projector), repeats=5)
-    name = "breast, from 9 files of 1280x1024 to points"
-    return [
-        Row("h", f"{name}, median; the authors' way has a mask given", whole, None, peer, "ms"),
-        Row("h", f"{name}: times faster than the authors' way", peer / whole, 3, 1, "x", at_least=True),
-        Row("h", f"{name}: points apart from the authors', median", apart, 0.03, None, "mm"),
-    ]
+    return {"whole_ms": whole, "peer_ms": peer, "times_faster": peer / whole, "apart_mm": apart}
 
 
 def median_ms(work: Callable[[], object], repeats: int = REPEATS) -> float:

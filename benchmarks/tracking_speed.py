@@ -6,22 +6,22 @@ the train extra its column stays empty.
 
 import resource
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from time import perf_counter
 from typing import cast
 
 import numpy as np
-import yaml
 
 from recon.model.rig import Rig
 from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from scenes.catalogue import build_scene
-from sonotwin.config import folder, load
+from sonotwin.config import load
 from sonotwin.verbs import sweep
-from twin.experiments.table_rows import Measurement, Row, Setup
-from twin.experiments.tracking_frames import study
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.tracking_frames import ranges_of, study
 from twin.shooting import Quality
 from twin.tracking import film_session, scene_frames
 from twin.tracking.mesh_bank import build_bank
@@ -35,54 +35,35 @@ FRAMES, REPEATS = 4, 12
 BATCHES, BATCH = 8, 5
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [tracked, published_shape, rendered, filmed]
+def few(setup: Setup) -> DataRanges:
+    """Ranges of few variants: the time of a sample doesn't depend on their number."""
+    return ranges_of(setup).model_copy(update={"variants": 4})
 
 
-def settings() -> tuple[Rig, DataRanges]:
-    """The rig, and few variants: the time of a sample doesn't depend on their number."""
-    rig = Rig.model_validate(yaml.safe_load((folder() / "rig" / "meza2021.yaml").read_text(encoding="utf-8")))
-    ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
-    return rig, DataRanges(**{**ranges, "variants": 4})
-
-
-def frames_of(rig: Rig, ranges: DataRanges) -> list[tuple]:
+def frames_of(setup: Setup) -> list[tuple]:
     """A few stereo frames, still and lit, of a target that nothing covers."""
-    return [given.views for _, given in study(Setup(rig, {}, frames=ranges), 1, FRAMES, 100.0, 0.0, 4)]
+    return [given.views for _, given in study(replace(setup, frames=few(setup)), 1, FRAMES, 100.0, 0.0, 4)]
 
 
-def tracked() -> list[Row]:
-    """Row g with our networks: locked on, and from nothing, beside the same networks in eager fp32 on every frame."""
-    rig, ranges = settings()
-    images = frames_of(rig, ranges)
-    ours = nets.load()
+def tracked(setup: Setup) -> Figures:
+    """With our networks: locked on, and from nothing, beside the same networks in eager fp32 on every frame."""
+    rig, images, ours = setup.rig, frames_of(setup), nets.load()
     locked = locked_seconds(rig, images, ours)
     cold = cold_seconds(rig, images, ours)
     theirs = cold_seconds(rig, images, eager("detector", "segmenter")) if find_spec("torch") else float("nan")
-    return [
-        Row("g", "locked on, two 1280x1024 frames to a pose", 1 / locked, 60, None, "1/s", at_least=True),
-        Row("g", "locked on: times faster than the same networks in eager fp32 on every frame", theirs / locked, 4, None, "x",
-            at_least=True),
-        Row("g", "from nothing: times faster than the same networks in eager fp32", theirs / cold, 1, None, "x", at_least=True),
-        Row("g", "from nothing: ms, eager fp32 as the limit", 1e3 * cold, None, 1e3 * theirs, "ms"),
-    ]  # fmt: skip
+    times = {"locked_faster": theirs / locked, "cold_faster": theirs / cold}
+    return times | {"locked_hz": 1 / locked, "cold_ms": 1e3 * cold, "eager_ms": 1e3 * theirs}
 
 
-def published_shape() -> list[Row]:
-    """Row g with networks of the published shape, untrained, as their time doesn't depend on weights.
+def published_shape(setup: Setup) -> Figures:
+    """With networks of the published shape, untrained, as their time doesn't depend on weights.
 
     The peer is their passes alone, two views and six patches in eager fp32, without anything that comes between and after.
     """
     if not find_spec("torch"):
-        return []
-    rig, ranges = settings()
-    images = frames_of(rig, ranges)
+        return {}
     published = median_of(lambda: network_pass(eager("published_detector", "published_segmenter")), 3)
-    return [
-        Row("g", "networks of the published shape alone, eager fp32, one stereo frame, over our locked-on whole function",
-            published / locked_seconds(rig, images, nets.load()), 4, None, "x", at_least=True),
-    ]  # fmt: skip
+    return {"times_faster": published / locked_seconds(setup.rig, frames_of(setup), nets.load())}
 
 
 def locked_seconds(rig: Rig, images: list[tuple], networks: Networks) -> float:
@@ -151,8 +132,8 @@ def eager(detector: str, segmenter: str) -> Networks:
     return Eager()
 
 
-def filmed() -> list[Row]:
-    """Row j: pairs of whole frames of a sweep over the breast a second, beside frames of which every pixel is rendered."""
+def filmed(setup: Setup) -> Figures:
+    """Pairs of whole frames of a sweep over the breast a second, beside frames of which every pixel is rendered."""
     fields = ["scene=breast", "path=raster", "filmed=true", "clocks.camera_hz=8", "name=scan", "out=unused"]
     config = load("sweep", fields, sweep.Config)
     scene = build_scene(config.scene)
@@ -161,21 +142,18 @@ def filmed() -> list[Row]:
     planned = sweep_session.plan_sweep(path, rig, scanned, scanner, config.clocks, config.pose_noise, seed)
     led = scene_frames.motions(*[planned.target.poses(late) for late in (0.0, -0.005, 0.005)])
     bank = scene_frames.make_bank(scene, rig, led, config.seed)
-    made = scene_frames.takes(bank, rig, settings()[1], config.frames, led, seed)
+    made = scene_frames.takes(bank, rig, few(setup), config.frames, led, seed)
     list(film_session.shoot(bank, rig, made[:BATCH], config.frames.quality, seed))
     start = perf_counter()
     list(film_session.shoot(bank, rig, made, config.frames.quality, seed))
     seconds = (perf_counter() - start) / len(made)
     whole = median_of(lambda: render_full(bank, rig, made[:1], Quality(window=2), seed), 1)
-    return [
-        Row("j", f"pairs of 1280x1024 frames of a sweep, {len(made)} of them", 1 / seconds, 3, None, "1/s", at_least=True),
-        Row("j", "times faster than two rays in every pixel", whole / seconds, 4, None, "x", at_least=True),
-    ]
+    return {"pairs": len(made), "rate_hz": 1 / seconds, "times_faster": whole / seconds}
 
 
-def rendered() -> list[Row]:
-    """Row a: default samples a second, and how much memory grows from one batch to the last."""
-    rig, ranges = settings()
+def rendered(setup: Setup) -> Figures:
+    """Default samples a second, and how much memory grows from one batch to the last."""
+    rig, ranges = setup.rig, few(setup)
     bank = build_bank(rig.target, ranges.variants, 2)
     batches = [[draw(ranges, rig, 2, BATCH * b + k) for k in range(BATCH)] for b in range(BATCHES + 1)]
     render_views(bank, rig, batches[0], Quality(), 2)
@@ -185,7 +163,4 @@ def rendered() -> list[Row]:
         render_views(bank, rig, batch, Quality(), 2)
     seconds = (perf_counter() - start) / (BATCHES * BATCH)
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    return [
-        Row("a", "default samples, stereo view and six patches", 1 / seconds, 2, None, "1/s", at_least=True),
-        Row("a", f"growth of the largest resident memory over {BATCHES * BATCH} samples", grown, 100, None, "MB"),
-    ]
+    return {"rate_hz": 1 / seconds, "samples": BATCHES * BATCH, "growth_mb": grown}

@@ -12,12 +12,10 @@ from time import perf_counter, process_time
 
 import numba
 import numpy as np
-import yaml
 
 from scenes.catalogue import build_scene
-from sonotwin.config import folder
 from twin.experiments.bmode_accuracy import peer
-from twin.experiments.table_rows import Measurement, Row
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan, scans
 from twin.ultrasound.echo_solids import body
@@ -27,14 +25,9 @@ from twin.ultrasound.transducer import Transducer
 FRAMES = 40
 
 
-def measurements() -> list[Measurement]:
-    """The rows of the group."""
-    return [frames, wires]
-
-
-def frames() -> list[Row]:
-    """Row b: frames a second on all cores, and the work of one frame on one."""
-    array = Transducer.model_validate(yaml.safe_load((folder() / "ultrasound" / "linear.yaml").read_text(encoding="utf-8")))
+def frames(setup: Setup) -> Figures:
+    """Frames a second on all cores, and the work of one frame on one."""
+    array = setup.scanners["linear"]
     made = body(build_scene({"kind": "breast"}))
     skin = next(one for one in made.solids if one.name == "breast")
     path = along_surface(SurfacePath(start_mm=(-10, -20), end_mm=(-10, 10), speed_mm_s=30, hand=Hand()), skin, array, 1)
@@ -53,22 +46,19 @@ def frames() -> list[Row]:
     numba.set_num_threads(threads)
     count = scatterers(array)
     theirs = peer()["plane_wave"]["seconds"] * count / peer()["plane_wave"]["scatterers"]
-    what = f"breast, {array.image_size[0]}x{array.image_size[1]}, some {count / 1e3:.0f} 000 scatterers"
-    return [
-        Row("b", f"{what}: frames a second, {threads} cores", 1 / seconds, 20, 1 / theirs, "1/s", at_least=True),
-        Row("b", f"{what}: one frame, seconds of one core", float(np.median(alone)), 0.2, theirs, "s"),
-    ]
+    figures = {"width": array.image_size[0], "height": array.image_size[1], "thousands": count / 1e3, "cores": threads}
+    return figures | {"rate_hz": 1 / seconds, "peer_hz": 1 / theirs, "frame_s": np.median(alone), "peer_s": theirs}
 
 
-def wires() -> list[Row]:
-    """Row w: the whole command that renders what a probe is calibrated from, with code that is compiled."""
+def wires(setup: Setup) -> Figures:
+    """The whole command that renders what a probe is calibrated from, with code that is compiled."""
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "sonotwin", "sweep", "scene=crosswire", "ultrasound=water", "path=wire"]
         for name in ("compiled", "timed"):
             start = perf_counter()
             subprocess.run([*command, f"out={Path(folder) / name}"], check=True, stdout=subprocess.DEVNULL)
             seconds = perf_counter() - start
-    return [Row("w", "30 B-scans of crossed wires, rendered and written, the whole command", seconds, 8, None, "s")]
+    return {"seconds": seconds}
 
 
 def scatterers(array: Transducer) -> float:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, mistakes, soak, sources, two_writers
 from recon.files import atomic
-from twin.experiments import table_rows
+from twin.experiments import document_tables
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT, DOCUMENT = ROOT / "outputs" / "campaign", ROOT / "docs" / "trust.md"
@@ -113,7 +113,7 @@ def main(arguments: Sequence[str]) -> int:
         faults += wrong
         with atomic.new_file(OUT / f"{name}.md") as path:
             path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        table_rows.refresh(DOCUMENT, name, "\n".join(lines))
+        document_tables.refresh(DOCUMENT, name, "\n".join(lines))
         print(f"{name}: {wrong} faults", *lines, "", sep="\n")
     return 1 if faults else 0
 

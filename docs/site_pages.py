@@ -12,8 +12,8 @@ from docutils import nodes
 from docutils.parsers.rst import Directive
 
 from sonotwin.verbs import accuracy
-from twin.experiments import kept_rows
-from twin.experiments.kept_rows import Kept
+from twin.experiments import result_rows
+from twin.experiments.result_rows import Row
 
 ROOT = Path(__file__).resolve().parent.parent
 HEADS = ("group", "id", "what", "measured", "bar", "limit", "unit", "met", "measured on", "commit")
@@ -34,7 +34,7 @@ filter();
 """
 
 
-def rows_page(rows: Sequence[Kept]) -> str:
+def rows_page(rows: Sequence[Row]) -> str:
     """All rows as an HTML table with a search, a choice of the group and one of missed rows."""
     groups = "".join(f"<option>{group}</option>" for group in dict.fromkeys(row.group for row in rows))
     fields = (
@@ -48,7 +48,7 @@ def rows_page(rows: Sequence[Kept]) -> str:
     return f'{fields}\n<div class="table-wrapper">{table}</div>\n<script>{SCRIPT}</script>'
 
 
-def _html_row(row: Kept) -> str:
+def _html_row(row: Row) -> str:
     bar = "" if row.bar is None else f"{row.sense} {row.bar:.4g}"
     limit = "" if row.limit is None else f"{row.limit:.4g}"
     met = {None: "", True: "yes", False: "no"}[row.met]
@@ -83,7 +83,7 @@ class AccuracyRows(Directive):
         environment = self.state.document.settings.env
         path = Path(environment.doc2path(environment.docname)).parent / self.arguments[0]
         environment.note_dependency(str(path))
-        return [nodes.raw("", rows_page(kept_rows.read(path)), format="html")]
+        return [nodes.raw("", rows_page(result_rows.read(path)), format="html")]
 
 
 class Rooms(Directive):
@@ -110,4 +110,4 @@ class Rooms(Directive):
 
 
 if __name__ == "__main__":
-    kept_rows.show(ROOT / "docs" / "accuracy.md", accuracy.choices())
+    result_rows.show(ROOT / "docs" / "accuracy.md", accuracy.choices())

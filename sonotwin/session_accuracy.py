@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.files import metrics
 from recon.files.code_digest import code_digest
-from recon.files.metrics import Metrics, shown
+from recon.files.metrics import Metrics
 from recon.probe_calibration import repeatability
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from recon.session import optics_step, plan, probe_step
@@ -25,30 +24,25 @@ from sonotwin.choices import read_rig
 from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings
 from sonotwin.verbs import reconstruct
 from twin.evaluation import session_errors
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.kept_figures import Kept
 from twin.ultrasound.timed_sweep import Clocks
 
 Array = NDArray[np.float64]
 
 SEEDS = tuple(range(721, 731))
 BOARD_SCALE = {"ideal": 0.0, "lifelike": 3.0e-4}  # as a lab knows its board's print: exact, and of conf/conditions/lifelike.yaml
-WIDER = {"ideal": 1.0, "lifelike": 1.7}  # bars of each kind of conditions
 RIG = "meza2021"
 POSES = "paper"  # of the board: 34, as in Meza et al. 2021
-CR1_MM, CR2_MM = (0.12, 0.16, 0.15), (0.08, 0.11, 0.10)  # bars: centre, corners, mean
-LENGTHS = {  # of the cylinders: figure, what it is the error of, its bar and the paper's, mm
-    "tube_diameter_error_mm": ("inner cylinder's diameter by ultrasound", 0.06, 0.72),
-    "cover_diameter_error_mm": ("outer cylinder's diameter by light", 0.03, 0.10),
-    "cover_wall_error_mm": ("distance of their walls by both", 0.06, 0.12),
-}
+LENGTHS = ("tube_diameter_error_mm", "cover_diameter_error_mm", "cover_wall_error_mm")  # of the cylinders
 MARK = "_true_extent_mm"  # of a tumour's figures, one a tumour
 PACKAGES = ("recon", "scenes", "twin", "sonotwin")
 TISSUE_M_S = 1450.0  # of the phantom's silicone
 BOTTOM_HZ = 20.0  # pairs of frames over the flat bottom
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group: ten sessions under each kind of conditions.
+def sessions(setup: Setup, conditions: str, seeds: Sequence[int] = SEEDS) -> Figures:
+    """Figures over sessions under one kind of conditions.
 
     Raises
     ------
@@ -57,22 +51,22 @@ def measurements(setup: Setup) -> list[Measurement]:
     """
     if setup.rig != read_rig(RIG):
         raise InputError(f"accuracy: rig: expected {RIG} for only=session, found another")
-    return [lambda kind=kind: rows(kind, [measured(setup.out, kind, seed) for seed in SEEDS]) for kind in WIDER]
+    return together([measured(setup.out, conditions, seed) for seed in seeds])
 
 
-def measured(kept: Path | None, conditions: str, seed: int) -> Metrics:
+def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
     """Figures of one session, by estimated calibrations and tracked poses; those kept in a folder, if they are of this code."""
-    path = None if kept is None else kept / "session" / f"{conditions}_{seed}_{code()}.json"
-    if path is not None and path.is_file():
-        return metrics.read(path)
+    kept, key = None if out is None else Kept(out / "session"), f"{conditions}_{seed}_{code()}"
+    if kept is not None and (found := kept.read(key)) is not None:
+        return found
     work = Path(mkdtemp(prefix="session"))
     try:
         whole, figures = session(work, conditions, seed)
     finally:
         shutil.rmtree(work)
-    if path is not None and whole:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        metrics.write(path, figures)
+    if kept is not None and whole:
+        kept.open()
+        kept.keep(key, figures)
     return figures
 
 
@@ -142,69 +136,56 @@ def code() -> str:
     return code_digest(*PACKAGES, config.folder())
 
 
-def rows(conditions: str, found: Sequence[Metrics]) -> list[Row]:
-    """Rows of some sessions: the worst of them, unless it says otherwise; NaN, which misses its bar, of what is missing."""
-    wider, name = WIDER[conditions], f"{conditions}, {len(found)} session{'' if len(found) == 1 else 's'}"
+def together(found: Sequence[Metrics]) -> Figures:
+    """Figures of some sessions, the worst of them unless the name says otherwise; NaN, which misses its bar, if one lacks it."""
     films = [f"{sweep}_track" for sweep in (WIRES, BOTTOM, SCAN)]
-    seen = each(found, f"{SCAN}_track_visible") / each(found, f"{SCAN}_track_frames")
-    tracked = np.array([each(found, f"{film}_visible_found") / each(found, f"{film}_visible") for film in films])
-    false = np.sum([each(found, f"{film}_false") for film in films])
+    tracked = [each(found, f"{film}_visible_found") / each(found, f"{film}_visible") for film in films]
     probe, sigma = each(found, f"{SCAN}_probe_worst_error_mm"), each(found, f"{SCAN}_probe_worst_sigma_mm")
-    names = sorted({key.removesuffix(MARK) for one in found for key in one if key.endswith(MARK)})
-    inside = np.sum([each(found, f"{name}_inside") == 1 for name in names], axis=0) - each(found, f"{SCAN}_tumours_false")
-    centres = np.array([each(found, f"{name}_centre_error_mm") for name in names])
-    volumes = np.array([each(found, f"{name}_volume_mm3") / each(found, f"{name}_true_volume_mm3") - 1 for name in names])
-    depths = np.array([each(found, f"{name}_under_skin_mm") - each(found, f"{name}_true_under_skin_mm") for name in names])
-    placed = each(found, f"{SCAN}_placement_over_sigma")
-    sigmas = np.array([each(found, f"{name}_centre_sigma_mm") for name in names])
-    deep = np.array([each(found, f"{name}_depth_sigma_mm") for name in names])
-    swollen = np.array([each(found, f"{name}_volume_sigma_mm3") / each(found, f"{name}_true_volume_mm3") for name in names])
-    contact, lag = each(found, f"{SCAN}_contact_bias_mm"), each(found, f"{SCAN}_lag_error_ms")
-    shift, turn = each(found, f"{SCAN}_track_shift_median_mm"), each(found, f"{SCAN}_track_turn_median_deg")
-    covered = 100 * each(found, f"{SCAN}_lag_covered").mean()
     apart = np.array([each(found, f"{SCAN}_{figure}") for figure in session_errors.PROBE_ERRORS]).T.reshape(-1, 5, 3)
-    several, none = len(found) > 1, np.full(5, np.nan)
-    return [
-        Row("a", f"{name}: frames that show the whole target to both", 100 * seen.min(), 90.0, None, "%", at_least=True),
-        Row("b", f"{name}: found, of pairs that show the target whole", 100 * tracked.min(), 99.0, None, "%", at_least=True),
-        Row("b", f"{name}: wrong poses in all sweeps", float(false), 0.0, 0.0, "poses"),
-        Row("b", f"{name}: translation in the scan, median", shift.max(), 0.03 * wider, None, "mm"),
-        Row("b", f"{name}: rotation in the scan, median", turn.max(), 0.05 * wider, None, "deg"),
-        Row("c", f"{name}: latency", np.abs(lag).max(), 1.5 * wider, None, "ms"),
-        Row("c", f"{name}: latency within its 95 % interval", covered, 80.0, 95.0, "%", at_least=True),
-        Row("d", f"{name}: probe, the worst of five pixels", probe.max(), 0.20 * wider, None, "mm"),
-        Row("d", f"{name}: the same over its predicted sigma, RMS", np.sqrt(np.mean((probe / sigma) ** 2)), None, 1.0, ""),
-        *repeated("CR1", name, repeatability.between_pairs(apart) if several else none, CR1_MM, wider),
-        *repeated("CR2", name, repeatability.from_mean(apart) if several else none, CR2_MM, wider),
-        *[cylinder(figure, name, each(found, figure), wider) for figure in LENGTHS],
-        Row("f", f"{name}: tumours found inside the skin, less false ones, of 3", inside.min(), 3.0, 3.0, "", at_least=True),
-        Row("f", f"{name}: tumours' centres", np.max(centres, initial=0.0), 0.35 * wider, None, "mm"),
-        Row("f", f"{name}: tumours' volumes", 100 * np.max(np.abs(volumes), initial=0.0), 6.0 * wider, None, "%"),
-        Row("f", f"{name}: least tissue over tumours", np.max(np.abs(depths), initial=0.0), 0.25 * wider, None, "mm"),
-        Row("s", f"{name}: places of pixels over their predicted sigma, RMS", rms(placed), 2.0, 1.0, ""),
-        Row("s", f"{name}: tumours' centres over their predicted sigma, RMS", rms(centres / sigmas), 2.0, 1.0, ""),
-        Row("s", f"{name}: tumours' volumes over theirs, RMS", rms(volumes / swollen), 2.0, 1.0, ""),
-        Row("s", f"{name}: least tissue over tumours over its, RMS", rms(depths / deep), 2.0, 1.0, ""),
-        Row("g", f"{name}: array's face from the skin by light, mean", abs(contact.mean()), 0.05 * wider, None, "mm"),
-        Row("g", f"{name}: the same, worst", np.abs(contact).max(), None, None, "mm"),
-    ]  # fmt: skip
+    several, contact = len(found) > 1, each(found, f"{SCAN}_contact_bias_mm")
+    figures: Figures = {
+        "sessions": len(found),
+        "visible_percent": 100 * (each(found, f"{SCAN}_track_visible") / each(found, f"{SCAN}_track_frames")).min(),
+        "tracked_percent": 100 * np.min(tracked),
+        "false_poses": np.sum([each(found, f"{film}_false") for film in films]),
+        "shift_mm": each(found, f"{SCAN}_track_shift_median_mm").max(),
+        "turn_deg": each(found, f"{SCAN}_track_turn_median_deg").max(),
+        "latency_ms": np.abs(each(found, f"{SCAN}_lag_error_ms")).max(),
+        "latency_covered_percent": 100 * each(found, f"{SCAN}_lag_covered").mean(),
+        "probe_mm": probe.max(),
+        "probe_over_sigma": rms(probe / sigma),
+        "pixels_over_sigma": rms(each(found, f"{SCAN}_placement_over_sigma")),
+        "contact_mm": abs(contact.mean()),
+        "worst_contact_mm": np.abs(contact).max(),
+    }
+    for name, measure in (("cr1", repeatability.between_pairs), ("cr2", repeatability.from_mean)):
+        mm = measure(apart) if several else np.full(5, np.nan)
+        figures |= {f"{name}_centre_mm": mm[0], f"{name}_corner_mm": mm[1:].max(), f"{name}_mean_mm": mm.mean()}
+    for name in LENGTHS:
+        errors = each(found, name)
+        figures |= {name: np.abs(errors).max(), f"{name}_mean": errors.mean()}
+        figures[f"{name}_spread"] = errors.std(ddof=1) if several else np.nan
+    return figures | tumours(found)
 
 
-def repeated(measure: str, name: str, mm: Array, bars: tuple[float, float, float], wider: float) -> list[Row]:
-    """Repeatability over sessions : (5,) mm, at the centre, the worst corner, and in the mean."""
-    found = {"centre": mm[0], "worst corner": mm[1:].max(), "mean of five pixels": mm.mean()}
-    return [
-        Row("d", f"{name}: probe, {measure}, {place}", float(value), bar * wider, None, "mm")
-        for (place, value), bar in zip(found.items(), bars, strict=True)
-    ]
+def tumours(found: Sequence[Metrics]) -> Figures:
+    """Figures of the tumours of some sessions."""
+    names = sorted({key.removesuffix(MARK) for one in found for key in one if key.endswith(MARK)})
 
+    def of(figure: str) -> Array:
+        return np.array([each(found, f"{name}_{figure}") for name in names])
 
-def cylinder(figure: str, name: str, errors: Array, wider: float) -> Row:
-    """Errors of a length of the cylinders over sessions : (n,) mm: the worst, with mean and spread."""
-    what, bar, paper = LENGTHS[figure]
-    spread = errors.std(ddof=1) if len(errors) > 1 else np.nan
-    text = f"{name}: {what} (mean {errors.mean():+.3f}, spread {shown(spread, '.3f')}; paper: {paper:.2f})"
-    return Row("e", text, float(np.abs(errors).max()), bar * wider, None, "mm")
+    inside = np.sum(of("inside") == 1, axis=0) - each(found, f"{SCAN}_tumours_false")
+    volumes, depths = of("volume_mm3") / of("true_volume_mm3") - 1, of("under_skin_mm") - of("true_under_skin_mm")
+    return {
+        "tumours_inside": inside.min(),
+        "centre_mm": np.max(of("centre_error_mm"), initial=0.0),
+        "volume_percent": 100 * np.max(np.abs(volumes), initial=0.0),
+        "tissue_mm": np.max(np.abs(depths), initial=0.0),
+        "centre_over_sigma": rms(of("centre_error_mm") / of("centre_sigma_mm")),
+        "volume_over_sigma": rms(volumes / (of("volume_sigma_mm3") / of("true_volume_mm3"))),
+        "tissue_over_sigma": rms(depths / of("depth_sigma_mm")),
+    }
 
 
 def rms(values: Array) -> float:

@@ -11,7 +11,7 @@ from recon.files.metrics import shown
 from recon.reports import page
 from recon.reports.page import Section
 from sonotwin import study_plan
-from twin.experiments import experiment_runs, table_rows
+from twin.experiments import document_tables, experiment_runs
 from twin.studies import beside_paper, budget_page, error_budget, factors, rig_search, search_page, study_page, study_runs
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
@@ -28,7 +28,7 @@ def sweep(config: "Config", console: Console) -> bool:
     """Do all points of a design; returns whether any trial gave figures."""
     trials = study_plan.trials(config.of, config.settings, design(config), seeds(config))
     if config.document is not None:
-        table_rows.check_place(config.document, config.name)
+        document_tables.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
     of = experiment_runs.experiment(config.of)
     for figure, limit in of.limits.items():
@@ -57,7 +57,7 @@ def _beside_paper(config: "Config", done: Sequence[Done], console: Console) -> S
         beside = (f"; limit of noise {limit}" if limit else "") + (f"; predicted for ours {predicted}" if predicted else "")
         console.print(f"{point:12}{what}: reported {reported}, its method {paper}, ours {ours}{beside} {unit}", markup=False)
     if config.document is not None:
-        table_rows.refresh(config.document, config.name, beside_paper.markdown(compared))
+        document_tables.refresh(config.document, config.name, beside_paper.markdown(compared))
     caption = (
         f"Means; in brackets the least, the greatest and the number of trials. Met: within a factor of {beside_paper.FACTOR:g}. "
         "Predicted for ours: by our software's covariances, with all that it can't exclude; no limit, so ours may be less."

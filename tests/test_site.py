@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sonotwin import config
-from twin.experiments import kept_rows
+from twin.experiments import result_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -68,7 +68,7 @@ def test_the_rooms_name_every_module(package, site_pages):
 
 def test_the_page_of_rows_has_each_row(site_pages):
     """Text is escaped; a browser finds group and verdict in the row."""
-    rows = kept_rows.read(ROOT / "docs" / "accuracy.csv")
+    rows = result_rows.read(ROOT / "docs" / "accuracy.csv")
     page = site_pages.rows_page(rows)
     assert page.count("<tr data-group=") == len(rows) and page.count('data-met="no"') == sum(row.met is False for row in rows)
     assert "<td>&lt;= 0.05</td>" in page and all(f"<option>{row.group}</option>" in page for row in rows)

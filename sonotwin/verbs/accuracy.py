@@ -1,15 +1,17 @@
 """Measure the errors of the twin and of the pipeline, beside their bars, the limits of physics and the paper's figures.
 
-Reads the rig and the pattern sequences from conf/, and real recordings where `real` names their folder. Writes GROUP.json into
-the folder `out`, a list of {id, what, measured, bar, limit, unit, ok, seconds}, and figures. With `document=docs/accuracy.md` the
-group's rows are replaced in docs/accuracy.csv, with day and commit, and the page's table is made of all rows there by
-conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for tracking, for which a thousand pairs of frames are
-rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
+Reads the rig and the pattern sequences from conf/, what is measured and asked from conf/bars/accuracy/GROUP.yaml, and
+real recordings where `real` names their folder. Writes into the folder `out` results.parquet, a row a figure with experiment,
+settings, value, bar, limit, unit, day and commit, and pictures; figures of the same code and settings are kept in OUT/kept/,
+from which a run goes on that was stopped. With `document=docs/accuracy.md` the group's rows are replaced in docs/accuracy.csv,
+and the page's table is made of all rows there by conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for
+tracking, for which a thousand pairs of frames are rendered, an hour for studies and three hours for sessions. Exit status 1
+if a bar is missed.
 
     sonotwin accuracy only=optics
 """
 
-from importlib import import_module
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -21,7 +23,10 @@ from recon.errors import InputError
 from recon.model.rig import Part, Rig
 from sonotwin.config import folder
 from twin.conditions import Conditions
-from twin.experiments import kept_rows, table_rows
+from twin.engine import Engine
+from twin.experiments import bars, document_tables, result_rows
+from twin.experiments.experiment_setup import Setup
+from twin.experiments.kept_figures import Kept
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
@@ -29,11 +34,6 @@ Group = Literal[
     "optics", "surface", "reality", "calibration", "scale", "lifelike", "ultrasound", "tracking", "session", "studies",
     "strangers", "trust", "live",
 ]  # fmt: skip
-MODULES = {
-    "session": "sonotwin.session_accuracy",
-    "studies": "sonotwin.study_accuracy",
-    "live": "sonotwin.live_accuracy",
-}  # of the others twin.experiments.GROUP_accuracy
 
 
 class Config(Part):
@@ -44,6 +44,7 @@ class Config(Part):
     out: Path
     document: Path | None
     real: Path | None
+    engine: Engine = Engine()
 
 
 def run(config: Config) -> int:
@@ -55,40 +56,43 @@ def run(config: Config) -> int:
         If a place to write to, or the real recordings, are not there.
     """
     groups = [config.only] if config.only else get_args(Group)
+    asked = {group: bars.read(folder() / "bars" / "accuracy" / f"{group}.yaml") for group in groups}
     if config.document:
-        table_rows.check_place(config.document, kept_rows.MARK)
-        kept_rows.read(kept_rows.file_of(config.document))
+        document_tables.check_place(config.document, result_rows.MARK)
+        result_rows.read(result_rows.file_of(config.document))
     shown = choices() if config.document else []  # as they are before hours of work
     if config.real and not config.real.is_dir():
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
-    config.out.mkdir(parents=True, exist_ok=True)
+    table = config.out / result_rows.TABLE
+    result_rows.read_table(table)
+    kept = Kept(config.out / "kept")
+    kept.open()
     setup = setup_of(config.rig, config.real, config.out)
+    day, commit = document_tables.state((config.document or folder()).parent)
     console = Console(soft_wrap=True, highlight=False)
     met = True
     for group in groups:
         measured = []
-        for row in table_rows.measure(
-            import_module(MODULES.get(group, f"twin.experiments.{group}_accuracy")).measurements(setup)
-        ):
-            verdict = "    " if row.bar is None else "ok  " if row.ok else "MISS"
-            asked = "" if row.bar is None else f" (bar {row.bar:.4g})"
-            console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{asked}", markup=False)
-            measured.append(row)
-        table_rows.write(config.out / f"{group}.json", measured)
+        for row in bars.measure(asked[group], setup, kept, config.engine):
+            verdict = {None: "    ", True: "ok  ", False: "MISS"}[row.met]
+            bar = "" if row.bar is None else f" (bar {row.bar:.4g})"
+            console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{bar}", markup=False)
+            measured.append(replace(row, day=day, commit=commit))
+        result_rows.write_table(table, group, measured)
         if config.document:
-            kept_rows.enter(config.document, shown, group, measured)
-        console.print(f"wrote {config.out / f'{group}.json'}", markup=False)
-        met &= all(row.ok for row in measured)
+            result_rows.enter(config.document, shown, group, measured)
+        console.print(f"wrote {table}", markup=False)
+        met &= all(row.met is not False for row in measured)
     return 0 if met else 1
 
 
-def choices() -> list[kept_rows.Chosen]:
+def choices() -> list[result_rows.Chosen]:
     """Rows of the document's table, as conf/bars/accuracy.yaml has them."""
-    return kept_rows.read_choices(folder() / "bars" / "accuracy.yaml")
+    return result_rows.read_choices(folder() / "bars" / "accuracy.yaml")
 
 
-def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> table_rows.Setup:
-    """Inputs of the measurements: a rig, all sequences and scanners of conf/, and real recordings if they are at hand."""
+def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> Setup:
+    """What experiments have at hand: a rig, all sequences and scanners of conf/, and real recordings if there are any."""
     sequences = {path.stem: read_patterns(path) for path in (folder() / "patterns").glob("*.yaml")}
     scanners = {
         path.stem: Transducer(**yaml.safe_load(path.read_text(encoding="utf-8")))
@@ -96,4 +100,4 @@ def setup_of(rig: Rig, real: Path | None = None, out: Path | None = None) -> tab
     }
     frames = DataRanges(**yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"])
     lifelike = Conditions(**yaml.safe_load((folder() / "conditions" / "lifelike.yaml").read_text(encoding="utf-8")))
-    return table_rows.Setup(rig, sequences, real, scanners, frames, out, lifelike)
+    return Setup(rig, sequences, real, scanners, frames, out, lifelike)

@@ -1,15 +1,19 @@
 """`sonotwin accuracy`: what it writes, its exit status, and what it refuses before it measures."""
 
-import json
 from pathlib import Path
 
 import pytest
 
 from sonotwin.cli import main
-from twin.experiments import kept_rows, optics_accuracy
-from twin.experiments.table_rows import Row
+from twin.experiments import bars, result_rows
+from twin.experiments.bars import Experiment, Figure
 
 ROOT = Path(__file__).resolve().parents[2]
+
+
+def measured(setup, value: float) -> dict[str, float]:
+    """An experiment that gives what it is given."""
+    return {"error_mm": value}
 
 
 @pytest.fixture
@@ -17,25 +21,25 @@ def quick(monkeypatch):
     """The optics group with one row, whose figure the test chooses."""
 
     def measure(value: float) -> None:
-        monkeypatch.setattr(
-            optics_accuracy, "measurements", lambda setup: [lambda: [Row("a", "an error", value, 0.05, None, "mm")]]
-        )
+        figure = Figure(id="a", figure="error_mm", what="an error", most=0.05, unit="mm")
+        one = Experiment("optics", f"{__name__}.measured", "", {"value": value}, {}, None, (figure,))
+        monkeypatch.setattr(bars, "read", lambda path: [one])
 
     return measure
 
 
 @pytest.mark.parametrize(("value", "status"), [(0.01, 0), (0.09, 1)])
 def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, capsys):
-    """JSON, file of rows and table hold the figure; rows of other groups stay; the exit status says whether the bar was met."""
+    """Parquet, file of rows and table hold the figure; rows of other groups stay; the status says whether the bar was met."""
     quick(value)
     page = tmp_path / "page.md"
     page.write_text("<!-- rows -->\n<!-- /rows -->\n")
-    others = kept_rows.read(ROOT / "docs" / "accuracy.csv")
-    kept_rows.write(page.with_suffix(".csv"), others)
+    others = result_rows.read(ROOT / "docs" / "accuracy.csv")
+    result_rows.write(page.with_suffix(".csv"), others)
     assert main(["accuracy", "only=optics", f"out={tmp_path / 'out'}", f"document={page}"]) == status
-    (record,) = json.loads((tmp_path / "out" / "optics.json").read_text())
-    assert (record["measured"], record["ok"]) == (value, status == 0)
-    first, *rest = kept_rows.read(page.with_suffix(".csv"))
+    (row,) = result_rows.read_table(tmp_path / "out" / "results.parquet")
+    assert (row.measured, row.met, row.settings) == (value, status == 0, f'{{"value": {value}}}')
+    first, *rest = result_rows.read(page.with_suffix(".csv"))
     assert (first.measured, first.met, first.what) == (value, status == 0, "an error")
     assert str(rest) == str([row for row in others if row.group != "optics"])
     assert (f"| an error | optics, row a | {value} mm | <= 0.05 |  |  | **no** |" in page.read_text()) == (status == 1)

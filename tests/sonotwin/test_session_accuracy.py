@@ -6,8 +6,9 @@ import pytest
 from recon.errors import InputError
 from scenes.catalogue import build_scene
 from sonotwin import rendered_session, session_accuracy
+from tests.twin.experiments import asked
 from twin.evaluation import session_errors
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 
 FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
 SCAN = {
@@ -31,7 +32,8 @@ def figures(**changes) -> dict:
 
 
 def missed(found) -> set[str]:
-    return {row.what.partition(": ")[2] for row in session_accuracy.rows("ideal", found) if not row.ok}
+    rows = asked.missed(session_accuracy.sessions, session_accuracy.together(found), conditions="ideal")
+    return {row.what.partition(": ")[2] for row in rows}
 
 
 def test_good_sessions_meet_all_bars():
@@ -59,7 +61,7 @@ def test_one_bad_session_is_enough(changes, row):
 def test_a_wrong_length_of_the_cylinders_fails_its_row(figure):
     """And mean and spread stand beside the worst."""
     found = [figures(), figures(**{figure: -0.07})]
-    rows = [row for row in session_accuracy.rows("ideal", found) if not row.ok]
+    rows = asked.missed(session_accuracy.sessions, session_accuracy.together(found), conditions="ideal")
     assert len(rows) == 1 and rows[0].measured == 0.07
     assert f"(mean {(CYLINDERS[figure] - 0.07) / 2:+.3f}, " in rows[0].what
 
@@ -100,7 +102,7 @@ def test_a_session_of_which_a_step_failed_misses_its_bars(rig):
 def test_another_rig_is_refused(rig):
     target = rig.target.model_copy(update={"c1_mm": 30.0})
     with pytest.raises(InputError, match="rig: expected meza2021 for only=session"):
-        session_accuracy.measurements(Setup(rig.model_copy(update={"target": target}), {}))
+        session_accuracy.sessions(Setup(rig.model_copy(update={"target": target})), "ideal")
 
 
 @pytest.mark.parametrize("kind", ["ideal", "lifelike"])

@@ -6,7 +6,6 @@ PyMUST's figures are kept in `benchmarks/pymust_peer.json`, with the command tha
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
 from scenes.acoustics import TISSUES, Tissue
 from scenes.scene_types import Material, Thing
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam
 from twin.ultrasound.bscan import scan
@@ -34,16 +33,8 @@ QUIET = Transducer(noise_db=-200.0, face_ring_mm=0.0, reverberations=0, tgc_db_p
 REFERENCE = Tissue(1.6, 1540.0, 0.0, 0.0)
 EMPTY = Tissue(1.5, 1540.0, 0.0, None)
 SHIFTS_MM = (0.2, 0.4, 0.6, 0.8)
-WINDOWS_MM = (15.0, 22.0, 30.0, 40.0)  # depths around which speckle is compared
 WINDOW_MM = 1.5  # on either side
 LEAST = 0.2  # correlation, below which no relative error is taken
-SEEDS = 6
-
-
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size. The rig does not matter."""
-    depths = [row["depth_mm"] for row in peer()["widths"]]
-    return [partial(widths, depths), speckle, lesions, partial(decorrelation, WINDOWS_MM, SEEDS)]
 
 
 def peer() -> dict:
@@ -51,16 +42,14 @@ def peer() -> dict:
     return json.loads(PEER.read_text(encoding="utf-8"))
 
 
-def widths(depths: Sequence[float]) -> list[Row]:
-    """Row a: full widths at half maximum of a point's echo, worst of some of the peer's depths."""
-    theirs = [row for row in peer()["widths"] if row["depth_mm"] in depths]
+def widths(setup: Setup, depths_mm: Sequence[float]) -> Figures:
+    """Full widths at half maximum of a point's echo, worst difference from the peer of some of its depths."""
+    theirs = [row for row in peer()["widths"] if row["depth_mm"] in depths_mm]
     ours = [point_widths(row["depth_mm"]) for row in theirs]
-    rows = []
-    for name, where in (("axial", "in depth"), ("lateral", "along the array"), ("elevational", "across the plane")):
-        share = [100 * abs(mine[name] / row[f"{name}_mm"] - 1) for mine, row in zip(ours, theirs, strict=True)]
-        what = f"point {depths[0]:g} to {depths[-1]:g} mm deep"
-        rows.append(Row("a", f"{what}: width {where}, worst difference from PyMUST", max(share), 15, 0.0, "%"))
-    return rows
+    return {
+        f"{name}_percent": max(100 * abs(mine[name] / row[f"{name}_mm"] - 1) for mine, row in zip(ours, theirs, strict=True))
+        for name in ("axial", "lateral", "elevational")
+    }
 
 
 def point_widths(depth: float) -> dict[str, float]:
@@ -108,26 +97,21 @@ def looking_down(array: Transducer, across: float = 0.0) -> Array:
     return upright @ rigid.transform(np.eye(3), (-array.width_mm / 2, 0, 0))
 
 
-def speckle() -> list[Row]:
-    """Row a: mean over standard deviation of the envelope; sqrt(pi / (4 - pi)) if fully developed."""
+def speckle(setup: Setup) -> Figures:
+    """Mean over standard deviation of the envelope; sqrt(pi / (4 - pi)) if fully developed."""
     body = Body(REFERENCE, (), ())
     envelope = np.stack([scan(body, QUIET, looking_down(QUIET), seed).envelope[80:] for seed in range(4)])
     found, theory = float(envelope.mean() / envelope.std()), np.sqrt(np.pi / (4 - np.pi))
-    beside = abs(peer()["block"]["speckle_snr"] - theory)
-    return [Row("a", f"speckle: signal-to-noise {found:.3f}, off from 1.91", abs(found - theory), 0.1, beside, "")]
+    return {"ratio": found, "off": abs(found - theory), "peer_off": abs(peer()["block"]["speckle_snr"] - theory)}
 
 
-def lesions() -> list[Row]:
-    """Row a: power in a rod across the plane over that of the same place without it; the limit is the peer's own contrast."""
+def lesions(setup: Setup) -> Figures:
+    """Power in a rod across the plane over that of the same place without it, and the peer's."""
     theirs = peer()["block"]
     found = contrast(theirs["lesion_echo_db"], theirs["depth_mm"], theirs["radius_mm"])
-    off = abs(found - theirs["lesion_db"])
     void = contrast(None, theirs["depth_mm"], theirs["radius_mm"])
-    what = f"rod of {2 * theirs['radius_mm']:g} mm, {theirs['depth_mm']:g} mm deep"
-    return [
-        Row("a", f"{what}, {theirs['lesion_echo_db']:g} dB: contrast {found:.1f} dB, off from PyMUST", off, 2, 0.0, "dB"),
-        Row("a", f"{what}, free of echoes: power left in it (PyMUST in the last column)", void, -40, theirs["void_db"], "dB"),
-    ]
+    own = {"contrast_db": found, "off_db": abs(found - theirs["lesion_db"]), "left_db": void, "peer_left_db": theirs["void_db"]}
+    return own | {"diameter_mm": 2 * theirs["radius_mm"], "depth_mm": theirs["depth_mm"], "echo_db": theirs["lesion_echo_db"]}
 
 
 def contrast(echogenicity: float | None, depth: float, radius: float) -> float:
@@ -146,16 +130,16 @@ def contrast(echogenicity: float | None, depth: float, radius: float) -> float:
     return float(10 * np.log10(power[0] / power[1]))
 
 
-def decorrelation(depths: Sequence[float], seeds: int) -> list[Row]:
-    """Row a: complex correlation of speckle before and after a step across the plane, against diffraction through the lens.
+def decorrelation(setup: Setup, depths_mm: Sequence[float], seeds: int) -> Figures:
+    """Complex correlation of speckle before and after a step across the plane, against diffraction through the lens.
 
-    The row's error is relative, the worst of all steps and depths at which theory has more than `LEAST`.
+    The error is relative, the worst of all steps and depths at which theory has more than `LEAST`.
     """
     array = QUIET
     body, spread = Body(REFERENCE, (), ()), beam(array)
-    rows = [np.abs(array.rows_mm - depth) < WINDOW_MM for depth in depths]
+    rows = [np.abs(array.rows_mm - depth) < WINDOW_MM for depth in depths_mm]
     steps = np.r_[0.0, SHIFTS_MM]
-    shared = np.zeros((len(depths), len(steps)), complex)
+    shared = np.zeros((len(depths_mm), len(steps)), complex)
     for seed in range(seeds):
         fields = []
         for across in np.concatenate([steps, SHIFTS_MM[-1] + steps[1:]]):
@@ -167,12 +151,8 @@ def decorrelation(depths: Sequence[float], seeds: int) -> list[Row]:
             for lag in range(len(steps)):
                 shared[k, lag] += (parts[: len(parts) - lag].conj() * parts[lag:]).sum(axis=1).mean()
     found = np.abs(shared) / seeds
-    theory = np.array([[lens_correlation(array, depth, shift) for shift in steps] for depth in depths])
-    error = np.abs(found - theory) / theory
-    counted = theory > LEAST
-    worst = 100 * float(error[counted].max())
-    what = f"speckle {depths[0]:g} to {depths[-1]:g} mm deep, {SHIFTS_MM[0]:g} to {SHIFTS_MM[-1]:g} mm across the plane"
-    return [Row("a", f"{what}: correlation, worst relative difference from diffraction", worst, 10, 0.0, "%")]
+    theory = np.array([[lens_correlation(array, depth, shift) for shift in steps] for depth in depths_mm])
+    return {"error_percent": 100 * (np.abs(found - theory) / theory)[theory > LEAST].max()}
 
 
 def lens_correlation(array: Transducer, depth: float, shift: float) -> float:

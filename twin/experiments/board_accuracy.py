@@ -16,7 +16,7 @@ from scenes.kinds import board
 from twin.evaluation.surface_errors import rms
 from twin.experiments.board_sets import drawn
 from twin.experiments.calibration_errors import DEPTHS, PAIRS, inside_region, point_errors, squared_length, squared_point_errors
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.surface_session import calibration_of
 
 Array = NDArray[np.float64]
@@ -39,27 +39,17 @@ class Calibrated:
     inside: float  # share of points in their 95 % region
 
 
-def rows(setup: Setup) -> list[Row]:
-    """Row a: form of planes and honesty with default settings, and forms by fixed choices."""
+def bowed_boards(setup: Setup) -> Figures:
+    """Form of planes and honesty with default settings, and forms by fixed choices."""
     found = [each(setup.rig, seed) for seed in SEEDS]
     forms = {name: np.array([choices[name].form_mm for choices in found]) for name in found[0]}
-    default = [choices["default"] for choices in found]
-    what, bows = f"{len(found)} boards", np.array([_bow(seed) for seed in SEEDS])
-    rows = [
-        Row("a", f"{what}: form of planes, largest", float(forms["default"].max()), 0.005, None, "mm"),
-        *(Row("a", f"{what}, {name}: form of planes, RMS", rms(form), None, None, "mm") for name, form in forms.items()),
-    ]
+    default, bows = [choices["default"] for choices in found], np.array([_bow(seed) for seed in SEEDS])
+    figures: Figures = {"boards": len(found), "form_mm": forms["default"].max()}
+    figures |= {f"{name}: form_mm": rms(form) for name, form in forms.items()}
     for bow in BOWS_MM:
         alike = {name: max(rms(form[bows == bow]), SMALL_MM) for name, form in forms.items()}
-        ratio = alike.pop("default") / min(alike.values())
-        rows.append(Row("a", f"boards bowed by {bow:g} mm: form over that of the best fixed choice", ratio, 1.1, 1.0, ""))
-    for name in ("parameters", "points"):
-        squared = float(np.mean([getattr(one, name) for one in default]))
-        squares = f"{what}: squared error of {name} over its expectation"
-        rows.append(Row("a", f"{squares}, at least", squared, 0.8, 1.0, "", at_least=True))
-        rows.append(Row("a", f"{squares}, at most", squared, 1.25, 1.0, ""))
-    inside = float(np.mean([one.inside for one in default]))
-    return [*rows, Row("a", f"{what}: points in their 95 % region", inside, 0.9, 0.95, "", at_least=True)]
+        figures[f"ratio_at_{bow:g}"] = alike.pop("default") / min(alike.values())
+    return figures | {name: np.mean([getattr(one, name) for one in default]) for name in ("parameters", "points", "inside")}
 
 
 def each(rig: Rig, seed: int, names: Collection[str] | None = None) -> Mapping[str, Calibrated]:

@@ -48,15 +48,13 @@ from twin.experiments.calibration_errors import (
     scale_sigma,
     squared_length,
 )
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.light_transport import Tracing, render
 from twin.optics.ray_world import move_things
 from twin.optics.surface_session import Shooting, calibration_of
 from twin.sensor import Exposure, auto_exposure, expose
 
 TRACING = Tracing(samples=16, room_lux=20)
-PAPER_RMS_PX = {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}
-DIAMETERS_MM, TILTS_DEG = (6.0, 9.0, 12.0), (0.0, 20.0, 40.0)
 QUIET = {"cam1": 1e-4, "cam2": 1e-4, "projector": 1e-4}  # px, where noise is not the question
 DRAWN_POSES = 20
 DRAWS = 30  # calibrations whose errors are compared with the prediction
@@ -64,28 +62,6 @@ DRAWS = 30  # calibrations whose errors are compared with the prediction
 BROWN = Settings(distortion="brown")  # OpenCV's five coefficients
 BENT_POSES = 16
 BENT = board.Config(warp_mm=0.2, print_error_mm=0.02, roughness=0.2)
-
-
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size."""
-    return [
-        lambda: against_truth(*calibrated(session(setup))),
-        *(
-            lambda diameter=diameter, tilt=tilt: [centre_bias(setup.rig, diameter, tilt)]
-            for diameter in DIAMETERS_MM
-            for tilt in TILTS_DEG
-        ),
-        *(
-            lambda diameter=diameter, tilt=tilt: [baseline_bias(setup.rig, diameter, tilt)]
-            for diameter in DIAMETERS_MM
-            for tilt in TILTS_DEG[1:]
-        ),
-        lambda: honesty(redrawn(setup)),
-        lambda: surfaces(setup, calibrated(session(setup))[1].adjustment.calibration),
-        lambda: bad_board(setup),
-        lambda: opencv_peer.in_many_draws(redrawn(setup)),
-        lambda: opencv_peer.in_one_render(*calibrated(session(setup))),
-    ]
 
 
 def session(setup: Setup, design: board.Config | None = None, poses: Poses | None = None) -> board_session.Settings:
@@ -109,43 +85,33 @@ def redrawn(setup: Setup) -> tuple[tuple[BoardSet, Result], ...]:
     return recalibrated(setup.rig, measured_noise(calibrated(session(setup))[1]), DRAWS, DRAWN_POSES)
 
 
-def against_truth(seen: BoardSet, result: Result) -> list[Row]:
-    """Row a: residuals and parameters; the limit is the prediction of detection and covariance."""
-    found, what = result.adjustment.calibration, f"{len(result.observations.poses)} poses"
-    rows = [
-        Row(
-            "a",
-            f"{what}, {name}: reprojection RMS (paper: {PAPER_RMS_PX[name]})",
-            rms,
-            0.05,
-            rms / result.adjustment.noise[name],
-            "px",
-        )
-        for name, rms in result.rms.items()
-    ]
+def against_truth(setup: Setup, poses: int = Poses().count) -> Figures:
+    """Residuals and parameters of a rendered session, beside the prediction of detection and covariance."""
+    seen, result = calibrated(session(setup, poses=Poses(count=poses)))
+    found, figures = result.adjustment.calibration, {"poses": len(result.observations.poses)}
+    for name, rms in result.rms.items():
+        figures |= {f"{name}_rms_px": rms, f"{name}_rms_limit_px": rms / result.adjustment.noise[name]}
+        error, sigma = focal_error(found, seen.truth, name), focal_sigma(found, name)
+        figures |= {f"{name}_focal_percent": error, f"{name}_focal_sigma_percent": sigma}
     for name in list(found.cameras)[1:]:
         turn, shift = motion_error(found, seen.truth, name)
         sigmas = motion_sigma(found, name)
-        rows.append(Row("a", f"{what}, {name} to cam1: rotation error", turn, 0.01, sigmas[0], "deg"))
-        rows.append(Row("a", f"{what}, {name} to cam1: translation error", shift, 0.05, sigmas[1], "mm"))
-    for name in found.cameras:
-        error = focal_error(found, seen.truth, name)
-        rows.append(Row("a", f"{what}, {name}: focal lengths, the larger error", error, 0.05, focal_sigma(found, name), "%"))
-    return rows
+        figures |= {f"{name}_turn_deg": turn, f"{name}_turn_sigma_deg": sigmas[0]}
+        figures |= {f"{name}_shift_mm": shift, f"{name}_shift_sigma_mm": sigmas[1]}
+    return figures
 
 
-def centre_bias(rig: Rig, diameter_mm: float, tilt_deg: float) -> Row:
-    """Row b: how far detected centres lie from the true ones, along the direction in which the correction moves them."""
+def centre_bias(setup: Setup, diameter_mm: float, tilt_deg: float) -> Figures:
+    """How far detected centres lie from the true ones, along the direction in which the correction moves them."""
     turned = Rotation.from_euler("x", tilt_deg, degrees=True) * Rotation.from_euler("z", 90, degrees=True)
     config = board.Config(diameter_mm=diameter_mm, rotation_deg=tuple(turned.as_rotvec(degrees=True)))
-    image, exposure = lit_board(rig, config)
-    camera, pose, design = rig.cam1.optics.camera(), board.world_from_board(config), board.design(config)
+    image, exposure = lit_board(setup.rig, config)
+    camera, pose, design = setup.rig.cam1.optics.camera(), board.world_from_board(config), board.design(config)
     offsets = centre_offsets(camera, pose, design.points(), diameter_mm / 2)
     error = detect(image, design, full=2.0**exposure.bits - 1).pixels - camera.project(board.circle_centres(config))
     along = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
     before, after = (abs(float(np.nanmean((left * along).sum(axis=1)))) for left in (error, error - offsets))
-    what = f"discs of {diameter_mm:g} mm, tilt {tilt_deg:g} deg: bias of corrected centres"
-    return Row("b", what, after, 0.01, before, "px")
+    return {"bias_px": after, "uncorrected_px": before}
 
 
 def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
@@ -168,16 +134,15 @@ def lit_board(rig: Rig, config: board.Config) -> tuple[np.ndarray, Exposure]:
     return expose(radiance, rig.cam1, wavelength, exposure, seed=3)[0], exposure
 
 
-def baseline_bias(rig: Rig, diameter_mm: float, tilt_deg: float, count: int = DRAWN_POSES) -> Row:
-    """Row b: the longer error of the two baselines without the correction; no noise."""
-    truth, design = calibration_of(rig), board.design(board.Config(diameter_mm=diameter_mm))
+def baseline_bias(setup: Setup, diameter_mm: float, tilt_deg: float, count: int = DRAWN_POSES) -> Figures:
+    """The longer error of the two baselines with and without the correction; no noise."""
+    truth, design = calibration_of(setup.rig), board.design(board.Config(diameter_mm=diameter_mm))
     poses = random_poses(Poses(count=count, tilt_deg=tilt_deg), design, list(truth.cameras.values()))
     seen = drawn(truth, design, poses, QUIET, np.random.default_rng(1))
     corrected = calibrate(seen.sightings, design, seen.sizes, BROWN)
     ignored = adjust(corrected.observations, corrected.adjustment.estimate, free_of(corrected))
     after, before = (baseline_error(fit.calibration, truth) for fit in (corrected.adjustment, ignored))
-    what = f"discs of {diameter_mm:g} mm, tilts up to {tilt_deg:g} deg: error of the baselines with the correction"
-    return Row("b", what, after, 0.01, before, "mm")
+    return {"error_mm": after, "uncorrected_mm": before}
 
 
 def free_of(result: Result) -> dict[str, tuple[str, ...]]:
@@ -185,8 +150,13 @@ def free_of(result: Result) -> dict[str, tuple[str, ...]]:
     return free_parameters(result.observations.devices, {name: MODELS[model] for name, model in result.model.items()})
 
 
-def honesty(drawings: Sequence[tuple[BoardSet, Result]]) -> list[Row]:
-    """Row c: errors of independent calibrations over their own predictions."""
+def honesty(setup: Setup) -> Figures:
+    """Errors of independent calibrations over their own predictions."""
+    return over_predictions(redrawn(setup))
+
+
+def over_predictions(drawings: Sequence[tuple[BoardSet, Result]]) -> Figures:
+    """Squared errors of parameters over their expectation, with its interval, and shares of points in their regions."""
     truth = drawings[0][0].truth
     volume = uncertainty.working_volume(truth, DEPTHS)
     squares, numbers, inside = [], [], {pair: [] for pair in PAIRS}
@@ -199,19 +169,8 @@ def honesty(drawings: Sequence[tuple[BoardSet, Result]]) -> list[Row]:
             inside[pair].append(inside_region(found, truth, pair, volume))
     freedom = sum(numbers)
     low, high = chi2.ppf([(1 - REGION) / 2, (1 + REGION) / 2], freedom) / freedom
-    what = f"{len(drawings)} calibrations"
-    ratio = sum(squares) / freedom
-    rows = [
-        Row("c", f"{what}: squared error of the parameters over its expectation, at least", ratio, low, 1.0, "", at_least=True),
-        Row("c", f"{what}: the same, at most", ratio, high, 1.0, ""),
-    ]
-    for pair in PAIRS:
-        share, between = float(np.mean(inside[pair])), " and ".join(pair)
-        rows.append(
-            Row("c", f"{what}: points of {between} in their 95 % region, at least", share, 0.90, REGION, "", at_least=True)
-        )
-        rows.append(Row("c", f"{what}: points of {between} in their 95 % region, at most", share, 0.98, REGION, ""))
-    return rows
+    figures = {"calibrations": len(drawings), "squared_error": sum(squares) / freedom, "low": low, "high": high}
+    return figures | {f"{pair[1]}_inside": float(np.mean(inside[pair])) for pair in PAIRS}
 
 
 @dataclass(frozen=True)
@@ -223,25 +182,19 @@ class Remeasured:
     metrics: Metrics
 
 
-def surfaces(setup: Setup, found: Calibration) -> list[Row]:
-    """Row d: the paper's planes and sphere through the estimated calibration."""
+def surfaces(setup: Setup, poses: int = Poses().count) -> Figures:
+    """The paper's planes and sphere through an estimated calibration."""
+    found = calibrated(session(setup, poses=Poses(count=poses)))[1].adjustment.calibration
     planes = [remeasure(setup, plane.build(pose), found, seed) for seed, pose in enumerate(plane.PAPER_POSES)]
-    rows = []
+    figures: Figures = {"scale_sigma_percent": scale_sigma(found)}
     for number, result in enumerate(planes, start=1):
-        what, limit = f"plane {number} of 5, estimated calibration", result.metrics["limit_rms_mm"]
-        flatness = result.metrics["plane_plate_rms_mm"]
-        rows.append(Row("d", f"{what}: RMS about the fitted plane (paper: 0.101 to 0.131)", flatness, 0.06, limit, "mm"))
-        rows.append(Row("d", f"{what}: error of scale", scale_error(result.measured, result.true), 0.02, scale_sigma(found), "%"))
+        figures[f"plane{number}_rms_mm"] = result.metrics["plane_plate_rms_mm"]
+        figures[f"plane{number}_limit_mm"] = result.metrics["limit_rms_mm"]
+        figures[f"plane{number}_scale_percent"] = scale_error(result.measured, result.true)
     together = [np.concatenate([getattr(result, name) for result in planes]) for name in ("measured", "true")]
-    rows.append(
-        Row(
-            "d", "5 planes together, estimated calibration: error of scale", scale_error(*together), 0.02, scale_sigma(found), "%"
-        )
-    )
     sphere = remeasure(setup, build_scene({"kind": "sphere"}), found, 10)
     radius = abs(sphere.metrics["sphere_sphere_radius_error_mm"])
-    rows.append(Row("d", "sphere of 19.8 mm, estimated calibration: radius error (paper: 0.045)", radius, 0.02, None, "mm"))
-    return rows
+    return figures | {"planes_scale_percent": scale_error(*together), "sphere_radius_error_mm": radius}
 
 
 def remeasure(setup: Setup, scene: Scene, found: Calibration, seed: int) -> Remeasured:
@@ -255,17 +208,16 @@ def remeasure(setup: Setup, scene: Scene, found: Calibration, seed: int) -> Reme
     return Remeasured(np.float64(points.points[used]), np.float64(shot.truth.points[used]), metrics)
 
 
-def bad_board(setup: Setup) -> list[Row]:
-    """Row e: a warped board with print errors and glare against a flat one in the same poses, taken as designed and as found."""
+def bad_board(setup: Setup) -> Figures:
+    """A warped board with print errors and glare against a flat one in the same poses, taken as designed and as found."""
     flat = rendered(session(setup)).first(BENT_POSES)
-    bent = rendered(session(setup, BENT, Poses(count=BENT_POSES)))
-    return board_shape(flat, bent)
+    return board_shape(flat, rendered(session(setup, BENT, Poses(count=BENT_POSES))))
 
 
-def board_shape(flat: BoardSet, bent: BoardSet) -> list[Row]:
-    """Rows of a board unlike its design: taken as designed, its tolerances given, and with its shape found, as by default.
+def board_shape(flat: BoardSet, bent: BoardSet) -> Figures:
+    """Errors with a board unlike its design: taken as designed, its tolerances given, and with its shape found, as by default.
 
-    Five coefficients a device, as a misfit of the board disturbs the choice of a lens model; the last row has the choice in.
+    Five coefficients a device, as a misfit of the board disturbs the choice of a lens model; `chosen` has the choice in.
     """
     known = Shape(released=False, in_plane_mm=BENT.print_error_mm, out_of_plane_mm=float(np.std(bent.points[:, 2])))
     found = {
@@ -275,18 +227,21 @@ def board_shape(flat: BoardSet, bent: BoardSet) -> list[Row]:
         "chosen": calibrate(bent.sightings, bent.board, bent.sizes),
     }
     volume = uncertainty.working_volume(bent.truth, DEPTHS)
-    error, predicted = {}, {}
+    figures: Figures = {"poses": len(bent.sightings)}
     for name, result in found.items():
-        error[name] = rms_length(point_errors(result.adjustment.calibration, bent.truth, PAIRS[1], volume))
-        predicted[name] = expected_length(result.adjustment.calibration, PAIRS[1], volume)
-    ratio = error["kept"] / predicted["kept"]
-    left = {name: (error[name] - error["flat"]) / (error["kept"] - error["flat"]) for name in ("released", "chosen")}
-    what = f"{len(bent.sightings)} poses, bent board"
-    shares = f"{what}, shape released: share of the excess over a flat board that is left"
-    return [
-        Row("e", f"{what}: error of points over the predicted one, or its inverse", max(ratio, 1 / ratio), 2.0, 1.0, ""),
-        Row("e", f"{what}: points, RMS error", error["kept"], 2 * predicted["kept"], predicted["kept"], "mm"),
-        Row("e", f"{what}, shape released: points, RMS error", error["released"], error["kept"], predicted["released"], "mm"),
-        Row("e", shares, left["released"], 0.5, 0.0, ""),
-        Row("e", f"{shares}, lens models chosen", left["chosen"], 0.5, 0.0, ""),
-    ]
+        calibration = result.adjustment.calibration
+        figures[f"{name}_mm"] = rms_length(point_errors(calibration, bent.truth, PAIRS[1], volume))
+        figures[f"{name}_predicted_mm"] = expected_length(calibration, PAIRS[1], volume)
+    ratio, excess = figures["kept_mm"] / figures["kept_predicted_mm"], figures["kept_mm"] - figures["flat_mm"]
+    left = {f"{name}_left": (figures[f"{name}_mm"] - figures["flat_mm"]) / excess for name in ("released", "chosen")}
+    return figures | left | {"kept_ratio": max(ratio, 1 / ratio)}
+
+
+def beside_opencv(setup: Setup) -> Figures:
+    """Errors of many drawn calibrations beside OpenCV's."""
+    return opencv_peer.in_many_draws(redrawn(setup))
+
+
+def beside_opencv_once(setup: Setup) -> Figures:
+    """Errors of the rendered session's calibration beside OpenCV's."""
+    return opencv_peer.in_one_render(*calibrated(session(setup)))

@@ -1,7 +1,7 @@
 """Rates at which the check of a rig finds and names what has moved, and of its false alarms: rows of the table of accuracy."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from twin.conditions import IDEAL, Conditions
 from twin.experiments import drawn_check, drawn_session
 from twin.experiments.drawn_check import Clocks, Devices
 from twin.experiments.drawn_session import Eye, Noise
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -53,15 +53,6 @@ MOVES: Moves = {
 }
 
 
-class Rates(NamedTuple):
-    """Counts over drawn rigs."""
-
-    rigs: int
-    alarms: int  # rigs of which nothing moved, and something is told to have
-    found: Counter[str]  # by the move: what moved is among those that are told to have
-    named: Counter[str]  # the same, and it alone
-
-
 class Laboratory(NamedTuple):
     """A calibrated rig, and how it is used."""
 
@@ -71,54 +62,16 @@ class Laboratory(NamedTuple):
     known: Uncertainty  # of it, when it is checked
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the part."""
-    return [lambda: rows(setup)]
-
-
-def rows(setup: Setup, rigs: int = RIGS) -> list[Row]:
-    """Rows h: over rigs drawn from a calibration of theory, and from one of a laboratory."""
-    measured = {"": IDEAL} | ({", calibrated in a laboratory": setup.lifelike} if setup.lifelike else {})
-    found = [
-        row for words, life in measured.items() for row in _rows(rates(setup.rig, life, setup.scanners["water"], rigs), words)
-    ]
-    return found + list(_warm_rows(warm_rates(setup.rig, rigs)))
-
-
-def _rows(counted: Rates, words: str) -> Iterator[Row]:
-    bars = {"cam1": 0.95, "cam2": 0.95, "projector": 0.95, "probe": 0.95, "clock": 0.95}
-    texts = {
-        "cam1": f"camera 1 turned by {TURN_DEG} deg",
-        "cam2": f"camera 2 turned by {TURN_DEG} deg",
-        "projector": f"projector shifted by {SHIFT_MM} mm any way, fringes along both axes",
-        "projector, columns": "the same, vertical fringes alone, which don't show two of three ways",
-        "projector, baseline": f"projector shifted by {SHIFT_MM} mm towards camera 1, which looks like drift",
-        "probe": f"bracket bent by {BEND_MM} mm",
-        "clock": f"clock off by {1e3 * LAG_S:g} ms",
-    }  # fmt: skip
-    for move, text in texts.items():
-        share = counted.named[move] / counted.rigs
-        yield Row("h", f"{text}{words}, {counted.rigs} rigs: found and named", share, bars.get(move), None, "", at_least=True)
-    shifted = f"{texts['projector']}{words}, {counted.rigs} rigs: found, and named alone or with another part"
-    yield Row("h", shifted, counted.found["projector"] / counted.rigs, None, None, "")
-    yield Row("h", f"nothing moved{words}: false alarms", counted.alarms / counted.rigs, 0.02, None, "")
-
-
-def _warm_rows(counted: Rates) -> Iterator[Row]:
-    text = f"projector shifted by {SHIFT_MM} mm any way, drift of {WARM_PX} px, {counted.rigs} rigs: found and named"
-    yield Row("h", text, counted.named["projector"] / counted.rigs, 0.95, None, "", at_least=True)
-    yield Row("h", f"nothing moved, drift of {WARM_PX} px: false alarms", counted.alarms / counted.rigs, 0.02, None, "")
-
-
-def rates(rig: Rig, life: Conditions, transducer: Transducer, rigs: int) -> Rates:
+def rates(setup: Setup, life: str, rigs: int = RIGS) -> Figures:
     """Draw rigs from one calibration, and check each as it is and with one part moved."""
-    lab = laboratory(rig, life, DRIFT_PX)
+    lab = laboratory(setup.rig, {"ideal": IDEAL, "lifelike": setup.lifelike}[life], DRIFT_PX)
+    transducer = setup.scanners["water"]
     return _counted(lambda k, true: _optics(lab, MOVES, true, k) | _tank(lab, true, transducer, k), lab, rigs)
 
 
-def warm_rates(rig: Rig, rigs: int) -> Rates:
+def warm_rates(setup: Setup, rigs: int = RIGS) -> Figures:
     """The same of devices that drift less, with a projector that was shifted."""
-    lab, moves = laboratory(rig, IDEAL, WARM_PX), {move: MOVES[move] for move in ("none", "projector")}
+    lab, moves = laboratory(setup.rig, IDEAL, WARM_PX), {move: MOVES[move] for move in ("none", "projector")}
     return _counted(lambda k, true: _optics(lab, moves, true, k), lab, rigs)
 
 
@@ -130,8 +83,8 @@ def laboratory(rig: Rig, life: Conditions, drift_px: float) -> Laboratory:
     return Laboratory(rig, life, optics, known)
 
 
-def _counted(checked: Callable[[int, Devices], dict[str, list[Verdict]]], lab: Laboratory, rigs: int) -> Rates:
-    """Counts over drawn rigs, of the verdicts on each by the move."""
+def _counted(checked: Callable[[int, Devices], dict[str, list[Verdict]]], lab: Laboratory, rigs: int) -> Figures:
+    """Shares of drawn rigs, of the verdicts on each by the move: what moved is found, or found alone; and false alarms."""
     alarms, found, named = set(), Counter(), Counter()
     for k in range(rigs):
         true = drawn_check.drawn_rig(lab.optics.cameras, lab.known, np.random.default_rng([SEED, k, 0]))
@@ -144,7 +97,9 @@ def _counted(checked: Callable[[int, Devices], dict[str, list[Verdict]]], lab: L
             rivals = {one.part for one in seen if one.state == "maybe"}
             found[move] += part in moved | rivals
             named[move] += moved == {part} and not rivals
-    return Rates(rigs, len(alarms), found, named)
+    sizes = {"turn_deg": TURN_DEG, "shift_mm": SHIFT_MM, "bend_mm": BEND_MM, "lag_ms": 1e3 * LAG_S, "warm_px": WARM_PX}
+    shares = {f"{move}: {how}": count[move] / rigs for how, count in (("found", found), ("named", named)) for move in count}
+    return sizes | shares | {"rigs": rigs, "alarms": len(alarms) / rigs}
 
 
 def _optics(lab: Laboratory, moves: Moves, true: Devices, k: int) -> dict[str, list[Verdict]]:

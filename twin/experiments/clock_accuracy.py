@@ -7,7 +7,8 @@ from recon.model.tracks import Track
 from recon.probe_calibration import latency
 from recon.probe_calibration.latency import Lag
 from scenes.catalogue import build_scene
-from twin.experiments.table_rows import Row, Setup
+from twin.evaluation.surface_errors import rms
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import body
@@ -21,23 +22,22 @@ DROPPED = 0.1  # of the images, and of the poses
 SEED = 11
 
 
-def rows(setup: Setup, draws: int = DRAWS, bob: Bob | None = None) -> list[Row]:
-    """Row g: error of the lag over all draws, and how often its interval of 95 % holds the truth."""
+def lags(setup: Setup, draws: int = DRAWS) -> Figures:
+    """Error of the lag over all draws, and how often its interval of 95 % holds the truth."""
     still = Clocks(lag_s=0.0, scanner_jitter_s=0.0)
-    made, array, path = body(build_scene({"kind": "tank"})), setup.scanners["water"], bob or Bob()
-    planned = sweep_session.plan_sweep(path, setup.rig, made, array, still, PoseNoise(), SEED)
+    made, array = body(build_scene({"kind": "tank"})), setup.scanners["water"]
+    planned = sweep_session.plan_sweep(Bob(), setup.rig, made, array, still, PoseNoise(), SEED)
     depths = np.array([latency.bottom_depth(one.image) for one in scans(made, array, planned.truth.poses, SEED)])
     rng = np.random.default_rng(SEED)
     found = [(true, drawn(setup, planned, depths, true, rng)) for true in LAGS_S for _ in range(draws)]
     errors = np.array([one.seconds - true for true, one in found])
-    held = np.mean([one.interval_s[0] <= true <= one.interval_s[1] for true, one in found])
-    sigma = np.median([one.sigma_s for _, one in found])
-    text = f"lags of 0 to 200 ms, jitter 5 ms, {100 * DROPPED:.0f} % dropped, {len(found)} draws"
-    return [
-        Row("g", f"{text}: largest error", 1e3 * np.abs(errors).max(), 5.0, None, "ms"),
-        Row("g", f"{text}: RMS error (limit: its own prediction)", 1e3 * np.sqrt(np.mean(errors**2)), 2.0, 1e3 * sigma, "ms"),
-        Row("g", f"{text}: share of intervals of 95 % that hold the truth", float(held), 0.9, 0.95, "", at_least=True),
-    ]
+    return {
+        "draws": len(found),
+        "largest_ms": 1e3 * np.abs(errors).max(),
+        "rms_ms": 1e3 * rms(errors),
+        "predicted_ms": 1e3 * np.median([one.sigma_s for _, one in found]),
+        "held": np.mean([one.interval_s[0] <= true <= one.interval_s[1] for true, one in found]),
+    }
 
 
 def drawn(setup: Setup, planned: Plan, depths: NDArray[np.float64], lag_s: float, rng: np.random.Generator) -> Lag:

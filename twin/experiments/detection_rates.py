@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.model.rig import Target
+from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from recon.tracking.views import View
 from twin.experiments import tracking_frames
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.tracking_frames import exactly_printed
 from twin.tracking.rendered_views import Frames
 from twin.tracking.samples import Take
 from twin.tracking.target_truth import ViewTruth
@@ -39,30 +41,28 @@ class Seen:
     exchanged: bool  # circles of the target, under wrong names
 
 
-def rows(setup: Setup, networks: Networks, samples: int = SAMPLES) -> list[Row]:
-    """Rates of finding, of wrong names and of false alarms."""
+def rates(setup: Setup, samples: int = SAMPLES) -> Figures:
+    """Rates of finding, of wrong names and of false alarms, in %."""
+    setup = exactly_printed(setup)
     unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, samples) for seed in SEEDS)
-    seen = list(scored(unseen, setup.rig.target, networks))
+    seen = list(scored(unseen, setup.rig.target, nets.load()))
     there = [view for view in seen if view.shows_target and view.blur_px <= BLURRED_PX]
     lit = [view for view in there if view.white_dn >= LIT_DN]
     dim = [view for view in there if DIM_DN <= view.white_dn < LIT_DN]
     covered = [view for view in seen if view.covered and sharp_and_lit(view)]
     found = [view for view in seen if view.found]
     empty = [view for view in seen if view.empty]
-    return [
-        Row("b", f"target views found rightly, white >= 15, blur <= 12 px ({len(lit)} views)",
-            percent(view.right for view in lit), 99.5, None, "%", at_least=True),
-        Row("b", f"target views found rightly, white 8 to 15, blur <= 12 px ({len(dim)} views)",
-            percent(view.right for view in dim), 95.0, None, "%", at_least=True),
-        Row("b", f"the same of views in which up to half of a disc is covered, white >= 15, blur <= 12 px ({len(covered)} views)",
-            percent(view.right for view in covered), 95.0, None, "%", at_least=True),
-        Row("b", f"wrong identity, of views found ({len(found)} views)",
-            percent(view.exchanged for view in found), 0.02, 0.0, "%"),
-        Row("b", f"false alarms on frames without target ({len(empty)} views)",
-            percent(view.found for view in empty), 0.1, 0.0, "%"),
-        Row("b", f"found, but neither right nor exchanged ({len(found)} views)",
-            percent(not view.right and not view.exchanged for view in found), 0.1, 0.0, "%"),
-    ]  # fmt: skip
+    counts = {
+        name: len(views) for name, views in {"lit": lit, "dim": dim, "covered": covered, "found": found, "empty": empty}.items()
+    }
+    return counts | {
+        "lit_percent": percent(view.right for view in lit),
+        "dim_percent": percent(view.right for view in dim),
+        "covered_percent": percent(view.right for view in covered),
+        "exchanged_percent": percent(view.exchanged for view in found),
+        "alarms_percent": percent(view.found for view in empty),
+        "elsewhere_percent": percent(not view.right and not view.exchanged for view in found),
+    }
 
 
 def sharp_and_lit(view: Seen) -> bool:

@@ -14,7 +14,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
         figures[f"plane_form_{name}_mm"] = by.form_mm
         figures[f"sphere_radius_error_{name}_mm"] = by.radius_error_mm
         figures[f"sphere_rms_{name}_mm"] = by.sphere_rms_mm
-        figures |= {f"reprojection_{device}_{name}_px": px[device] for device in lifelike_accuracy.PAPER_PX}
+        figures |= {f"reprojection_{device}_{name}_px": px[device] for device in lifelike_accuracy.DEVICES}
     figures["plane_limit_mm"], figures["sphere_limit_mm"] = found.limit_mm
     figures["error_over_sigma"] = found.squared**0.5
     return figures

@@ -22,12 +22,11 @@ from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Settings, calibrate
 from twin.experiments.board_sets import drawn
 from twin.experiments.calibration_errors import REGION
-from twin.experiments.table_rows import Row
+from twin.experiments.experiment_setup import Figures, Setup
 
 Array = NDArray[np.float64]
 
 SEEDS = range(1000, 1200)  # of point sets that nothing was tried on
-FEWER = range(1000, 1050)  # the same, of models that are given
 BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=8, diameter_mm=5)
 SIZE, FOCAL_PX = (1280, 1024), (1000.0, 3400.0)
 NOISE_PX = 0.02
@@ -48,20 +47,10 @@ class Judged:
     one_to_one: bool
 
 
-def rows() -> list[Row]:
-    """Row b: the lens model chosen automatically, and two that are given though they are too rich for the points."""
-    found = []
-    for distortion, seeds in (("auto", SEEDS), ("rational", FEWER), ("tilted", FEWER)):
-        judged = [each(seed, distortion) for seed in seeds]
-        what = f"{len(judged)} point sets, {distortion} lenses"
-        inside, torn = float(np.mean([one.inside for one in judged])), sum(not one.one_to_one for one in judged)
-        found += [
-            Row("b", f"{what}: with a pole or a fold in the image", torn, 0, 0, ""),
-            Row("b", f"{what}: pixels whose error lies in the predicted 95 % region, at least", inside, 0.9, 0.95, "",
-                at_least=True),
-            Row("b", f"{what}: the same, at most", inside, 0.98, 0.95, ""),
-        ]  # fmt: skip
-    return found
+def far_from_points(setup: Setup, lenses: str, sets: int) -> Figures:
+    """Lens models chosen automatically, or given though they are too rich for the points."""
+    judged = [each(seed, lenses) for seed in SEEDS[:sets]]
+    return {"torn": sum(not one.one_to_one for one in judged), "inside": np.mean([one.inside for one in judged])}
 
 
 def each(seed: int, distortion: ModelName | str) -> Judged:

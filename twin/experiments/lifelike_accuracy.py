@@ -20,12 +20,12 @@ from scenes.kinds import board, plane, sphere
 from twin import board_session
 from twin.conditions import BoardPrint, drifted, flexed, printed_board
 from twin.evaluation.surface_errors import rms
-from twin.experiments import board_accuracy, lens_accuracy, paper_causes, surface_accuracy
+from twin.experiments import board_accuracy, surface_accuracy
 from twin.experiments.baselines import opencv_peer
 from twin.experiments.board_sets import BoardSet, drawn, rendered
-from twin.experiments.plane_and_sphere import Measured, as_published, conditions_of, measured
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.plane_and_sphere import Measured, as_published, measured
 from twin.experiments.surface_accuracy import Experiment
-from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.optics.surface_session import Shooting, calibration_of
 from twin.working_range import working_range
 
@@ -33,9 +33,7 @@ Array = NDArray[np.float64]
 
 SEEDS = range(300, 310)  # of laboratories that nothing was tried on
 COUNT = 12  # poses of the board
-PAPER_PX = {"cam1": 0.138, "cam2": 0.151, "projector": 0.131}
-PAPER_PLANE_MM, PAPER_SPHERE_MM = (0.101, 0.131), (0.045, 0.040)  # RMS; radius error and RMS
-FACTOR = 1.5  # between the paper's figures and those of its method here
+DEVICES = ("cam1", "cam2", "projector")
 
 
 @dataclass(frozen=True)
@@ -50,41 +48,16 @@ class Laboratory:
     limit_mm: tuple[float, float]  # RMS of plane and sphere that the sensor's noise leaves
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size."""
-    return [
-        lambda: board_accuracy.rows(setup),
-        lens_accuracy.rows,
-        lambda: rows(setup),
-        lambda: shares(setup),
-        lambda: paper_causes.rows(setup),
-    ]
-
-
-def rows(setup: Setup) -> list[Row]:
-    """Rows g and h: planes and a sphere by both methods, and the reprojection by the paper's."""
-    patterns = setup.sequences["paper_surface"]
-    found = [laboratory(session(setup, seed), patterns) for seed in SEEDS]
-    ours, paper = ([getattr(one, name) for one in found] for name in ("ours", "paper"))
-    what = f"{len(found)} laboratories, {COUNT} poses"
-    squared = float(np.mean([one.squared for one in found]))
-    planes, spheres = (float(np.mean([getattr(one, name) for one in paper])) for name in ("plane_rms_mm", "sphere_rms_mm"))
-    rows = [
-        Row("g", f"{what}: planes, RMS, largest", max(one.plane_rms_mm for one in ours), 0.045, None, "mm"),
-        Row("g", f"{what}: planes, form, largest", max(one.form_mm for one in ours), 0.01, None, "mm"),
-        Row("g", f"{what}: sphere, radius error, largest", max(abs(one.radius_error_mm) for one in ours), 0.02, None, "mm"),
-        Row("g", f"{what}: squared error of parameters over its expectation, at least", squared, 0.8, 1.0, "", at_least=True),
-        Row("g", f"{what}: the same, at most", squared, 1.25, 1.0, ""),
-    ]
-    for name, published in PAPER_PX.items():
-        px = float(np.mean([one.paper_px[name] for one in found]))
-        rows += _beside(f"{what}, the paper's method, {name}: reprojection RMS (paper: {published:g}), mean", px, published, "px")
-    middle = float(np.mean(PAPER_PLANE_MM))
-    rows += _beside(f"{what}, the paper's method: planes, RMS (paper: 0.101 to 0.131), mean", planes, middle, "mm")
-    radius = float(np.mean([abs(one.radius_error_mm) for one in paper]))
-    rows += _beside(f"{what}, the paper's method: sphere, radius error (paper: 0.045), mean", radius, PAPER_SPHERE_MM[0], "mm")
-    rows += _beside(f"{what}, the paper's method: sphere, RMS (paper: 0.04), mean", spheres, PAPER_SPHERE_MM[1], "mm")
-    return rows
+def laboratories(setup: Setup) -> Figures:
+    """Planes and a sphere by both methods, and the reprojection by the paper's."""
+    found = [laboratory(session(setup, seed), setup.sequences["paper_surface"]) for seed in SEEDS]
+    figures: Figures = {"laboratories": len(found), "poses": COUNT, "squared": np.mean([one.squared for one in found])}
+    for name in ("plane_rms_mm", "form_mm", "radius_error_mm", "sphere_rms_mm"):
+        ours, paper = (
+            np.abs([getattr(by, name) for by in of]) for of in ([one.ours for one in found], [one.paper for one in found])
+        )
+        figures |= {f"{name}_largest": ours.max(), f"{name}_paper": paper.mean()}
+    return figures | {f"{name}_paper_px": np.mean([one.paper_px[name] for one in found]) for name in DEVICES}
 
 
 def laboratory(session: board_session.Settings, patterns: Patterns) -> Laboratory:
@@ -97,7 +70,7 @@ def laboratory(session: board_session.Settings, patterns: Patterns) -> Laborator
     observations = (result := calibrate(seen.sightings, seen.board, seen.sizes)).observations
     pair = opencv_peer.stereo(observations, "projector", np.zeros_like(observations.pixels))
     shots = shoot(session, patterns)
-    reprojected = {name: opencv_peer.reprojection_rms(observations, name) for name in PAPER_PX}
+    reprojected = {name: opencv_peer.reprojection_rms(observations, name) for name in DEVICES}
     ours = result.adjustment.calibration
     squared = figures_of_merit.normalised_error(ours, seen.truth) ** 2
     flat, ball = (as_published(shot, patterns) for shot in shots)
@@ -116,7 +89,7 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
         surface_accuracy.TRACING,
         Shooting(),
         seed,
-        conditions_of(setup),
+        setup.lifelike,
     )
 
 
@@ -135,23 +108,20 @@ def shoot(session: board_session.Settings, patterns: Patterns) -> tuple[Experime
     return first, second
 
 
-def shares(setup: Setup) -> list[Row]:
-    """Row h: each condition of the board alone, and all together: reprojection by the paper's method, form by both."""
-    errors, rows, truth = conditions_of(setup).board, [], calibration_of(setup.rig)
-    alone = {field: BoardPrint(**{field: getattr(errors, field)}) for field in BoardPrint.model_fields if field != "diameter_mm"}
-    for name, chosen in {"flat, exact board": BoardPrint(), **alone, "all of them": errors}.items():
-        kinds = [sighted(setup.rig, chosen, seed) for seed in SEEDS]
-        ours, paper, px = [], [], []
-        for seen in kinds:
-            result = calibrate(seen.sightings, seen.board, seen.sizes)
-            pair = opencv_peer.stereo(result.observations, "projector", np.zeros_like(result.observations.pixels))
-            px.append(opencv_peer.reprojection_rms(result.observations, "cam1"))
-            ours.append(board_accuracy.form(result.adjustment.calibration, truth))
-            paper.append(board_accuracy.form(pair, truth))
-        what = f"board: {name}, the paper's method"
-        rows.append(Row("h", f"{what}: camera 1, reprojection RMS (paper: 0.138)", rms(np.array(px)), None, None, "px"))
-        rows.append(Row("h", f"{what}: form of planes (limit: ours)", rms(np.array(paper)), None, rms(np.array(ours)), "mm"))
-    return rows
+def shares(setup: Setup, cause: str) -> Figures:
+    """Reprojection by the paper's method, and form by both, of boards of one condition alone, of none, or of all together."""
+    errors, truth = setup.lifelike.board, calibration_of(setup.rig)
+    alone = {field: BoardPrint(**{field: getattr(errors, field)}) for field in BoardPrint.model_fields}
+    chosen = ({"flat, exact board": BoardPrint(), "all of them": errors} | alone)[cause]
+    ours, paper, px = [], [], []
+    for seed in SEEDS:
+        seen = sighted(setup.rig, chosen, seed)
+        result = calibrate(seen.sightings, seen.board, seen.sizes)
+        pair = opencv_peer.stereo(result.observations, "projector", np.zeros_like(result.observations.pixels))
+        px.append(opencv_peer.reprojection_rms(result.observations, "cam1"))
+        ours.append(board_accuracy.form(result.adjustment.calibration, truth))
+        paper.append(board_accuracy.form(pair, truth))
+    return {"paper_px": rms(np.array(px)), "paper_form_mm": rms(np.array(paper)), "our_form_mm": rms(np.array(ours))}
 
 
 def sighted(rig: Rig, errors: BoardPrint, seed: int) -> BoardSet:
@@ -161,11 +131,3 @@ def sighted(rig: Rig, errors: BoardPrint, seed: int) -> BoardSet:
     printed = printed_board(board.Config(), errors, seed)
     points = np.stack([board.printed_centres(flexed(printed, errors, seed, k)) for k in range(COUNT)])
     return drawn(truth, design, poses, board_accuracy.NOISE_PX, np.random.default_rng([seed, 6]), points)
-
-
-def _beside(what: str, found: float, published: float, unit: str) -> list[Row]:
-    """A figure of the paper's method, not further from the published one than by a factor."""
-    return [
-        Row("h", f"{what}, at least", found, published / FACTOR, published, unit, at_least=True),
-        Row("h", f"{what}, at most", found, published * FACTOR, published, unit),
-    ]

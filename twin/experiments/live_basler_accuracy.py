@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.devices.device_clocks import LOG, WINDOW, ClockFollower, Jump, fit_clock
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.evaluation.surface_errors import rms
+from twin.experiments.experiment_setup import Figures, Setup
 
 Times = NDArray[np.int64]
 Delays = Callable[[np.random.Generator, int], NDArray[np.float64]]
@@ -31,34 +32,24 @@ DELAYS: Mapping[str, Delays] = {
 }
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the part: errors of maps, jumps that are found, false ones."""
-    return [*(lambda name=name: maps(name) for name in DELAYS), jumps, load]
-
-
-def maps(name: str) -> list[Row]:
-    """Row a: error of a map at the newest of its frames, and of the rate."""
+def maps(setup: Setup, delays: str, draws: int = DRAWS) -> Figures:
+    """Error of a map at the newest of its frames, and of the rate."""
     rng, errors, rates, sigmas = np.random.default_rng(SEED), [], [], []
-    for _ in range(DRAWS):
+    for _ in range(draws):
         rate = 1 + CRYSTALS * rng.standard_normal()
-        device, true, arrived = drawn(rng, WINDOW, rate, DELAYS[name])
+        device, true, arrived = drawn(rng, WINDOW, rate, DELAYS[delays])
         clock = fit_clock(device, arrived)
         errors.append((clock.at(int(device[-1])) - int(true[-1]) - TRANSFER_NS) / 1e3)
         sigmas.append(clock.sigma_at(int(device[-1])) / 1e3)
         rates.append(1e6 * (clock.rate - rate))
-    inside = float(np.mean(np.abs(errors) < 3 * np.array(sigmas)))
-    text = f"a device's clock by {WINDOW} frames in 10 s, late by {name}"
-    return [
-        Row("a", f"{text}: error of the newest time, 95 %", float(np.quantile(np.abs(errors), 0.95)), 100.0, None, "us"),
-        Row("a", f"{text}: error of the rate, RMS", float(np.sqrt(np.mean(np.square(rates)))), 5.0, None, "ppm"),
-        Row("a", f"{text}: share of errors within three of their standard deviations", inside, 0.98, None, "", at_least=True),
-    ]
+    inside, newest = np.mean(np.abs(errors) < 3 * np.array(sigmas)), np.quantile(np.abs(errors), 0.95)
+    return {"frames": WINDOW, "newest_us": newest, "rate_ppm": rms(np.array(rates)), "inside": inside}
 
 
-def jumps() -> list[Row]:
-    """Row i: clocks that are set forward or back by 10 ms to an hour, under delays of any kind."""
+def jumps(setup: Setup, clocks: int = STEPS) -> Figures:
+    """Clocks that are set forward or back by 10 ms to an hour, under delays of any kind."""
     rng, found, off = np.random.default_rng(SEED), 0, []
-    for draw in range(STEPS):
+    for draw in range(clocks):
         device, _, arrived = drawn(rng, 700, 1 + CRYSTALS * rng.standard_normal(), list(DELAYS.values())[draw % len(DELAYS)])
         step = rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(SHORTEST_S), np.log(LONGEST_S)))
         at = int(rng.integers(100, 500))
@@ -67,21 +58,16 @@ def jumps() -> list[Row]:
         if len(named) == 1 and named[0].device_ns == device[at]:
             found += 1
             off.append(abs(named[0].step_ns / 1e6 - 1e3 * step))
-    text = f"{STEPS} clocks set anew by 10 ms to 1 h, forward or back"
-    return [
-        Row("i", f"{text}: named once, at the right frame", found / STEPS, 0.95, 1.0, "", at_least=True),
-        Row("i", f"{text}: error of the step, median", float(np.median(off)), 5.0, None, "ms"),
-    ]
+    return {"clocks": clocks, "named": found / clocks, "step_ms": np.median(off)}
 
 
-def load() -> list[Row]:
-    """Row i: no jump where a busy computer takes frames over late, by 30 ms on average for ten minutes."""
+def load(setup: Setup, frames: int = LOAD_FRAMES) -> Figures:
+    """Jumps found where a busy computer takes frames over late, by 30 ms on average for a third of the time."""
     rng = np.random.default_rng(SEED)
-    device, _, arrived = drawn(rng, LOAD_FRAMES, 1 + CRYSTALS, DELAYS["0.1 ms, and 10 ms in a fifth of the frames"])
-    third = LOAD_FRAMES // 3
+    device, _, arrived = drawn(rng, frames, 1 + CRYSTALS, DELAYS["0.1 ms, and 10 ms in a fifth of the frames"])
+    third = frames // 3
     arrived[third : 2 * third] += np.int64(rng.exponential(3e7, third))
-    false = followed(device, np.maximum.accumulate(arrived))
-    return [Row("i", "half an hour of frames, a third of it 30 ms late: clocks falsely set anew", len(false), 0, None, "")]
+    return {"false": len(followed(device, np.maximum.accumulate(arrived)))}
 
 
 def drawn(rng: np.random.Generator, n: int, rate: float, delays: Delays) -> tuple[Times, Times, Times]:

@@ -29,34 +29,28 @@ from twin import board_session
 from twin.board_session import CAMERAS
 from twin.devices.virtual_session import StillSettings, before_board
 from twin.experiments.calibration_errors import DEPTHS, PAIRS, point_errors, rms_length
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.surface_accuracy import TRACING
-from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.optics.surface_session import Shooting
 from twin.sensor import Exposure
 
 POSES, SEED = 8, 5
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the part."""
-    return [lambda: rows(setup)]
-
-
-def rows(setup: Setup) -> Sequence[Row]:
-    """Rows d: how well the board's points fit, and where the calibrations have points of the volume."""
+def guided_board(setup: Setup) -> Figures:
+    """How well the board's points fit, and where the calibrations have points of the volume, recorded beside rendered."""
     patterns = setup.sequences["paper_calibration"]
     with TemporaryDirectory() as folder:
         recorded, rendered = Path(folder) / "recorded", Path(folder) / "rendered"
         poses = record(recorded, setup.rig, patterns)
         render(rendered, setup.rig, patterns, poses, read_manifest(recorded).devices)
         first, second = (calibrated(each) for each in (recorded, rendered))
-    text = f"board in {len(poses)} guided poses, recorded from virtual devices beside rendered"
-    both = first.adjustment.calibration, second.adjustment.calibration
     change = max(abs(first.rms[device] / second.rms[device] - 1) for device in second.rms)
-    return [
-        Row("d", f"{text}: relative difference of the reprojection's RMS, largest of all devices", change, 0.15, None, ""),
-        Row("d", f"{text}: calibrations apart at points, over their standard deviations", apart(*both), 2.0, 1.0, ""),
-    ]
+    return {
+        "poses": len(poses),
+        "rms_change": change,
+        "apart": apart(first.adjustment.calibration, second.adjustment.calibration),
+    }
 
 
 class Watched:

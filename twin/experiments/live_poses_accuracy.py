@@ -27,7 +27,7 @@ from twin import conditions
 from twin.conditions import BoardPrint
 from twin.experiments.board_sets import drawn
 from twin.experiments.calibration_errors import DEPTHS, PAIRS, point_errors, rms_length
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.surface_session import calibration_of
 
 GUIDED, RANDOM = 12, 24  # poses
@@ -69,7 +69,7 @@ class Guided(NamedTuple):
     seconds: tuple[float, ...]  # from a pose that is held to the next that is asked for
 
 
-class Figures(NamedTuple):
+class Errors(NamedTuple):
     """Root mean squares over a volume and both pairs of devices, mm."""
 
     error: float  # of points in the world
@@ -78,38 +78,23 @@ class Figures(NamedTuple):
     predicted_within: float
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the part."""
-    life = setup.lifelike.board if setup.lifelike else BoardPrint()
-    return [
-        lambda: against_random(setup.rig, BoardPrint(), "board as designed"),
-        lambda: against_random(setup.rig, life, "board of an office printer, in hands"),
-        lambda: [tries(setup.rig)],
-    ]
-
-
-def against_random(rig: Rig, errors: BoardPrint, what: str) -> list[Row]:
-    """Row g: errors of points after guided poses over those after twice as many random ones; the limit: poses held as asked."""
-    sessions = [Session(rig, errors, seed) for seed in SEEDS]
+def against_random(setup: Setup, life: str) -> Figures:
+    """Errors of points after guided poses over those after twice as many random ones; `steady`: poses held as asked."""
+    errors = {"ideal": BoardPrint(), "lifelike": setup.lifelike.board}[life]
+    sessions = [Session(setup.rig, errors, seed) for seed in SEEDS]
     steady = [session._replace(missed=STEADY) for session in sessions]
     few, best = (over_seeds([figures(by_guidance(session), session) for session in each]) for each in (sessions, steady))
     many = over_seeds([figures(by_chance(session), session) for session in sessions])
-    label = f"{GUIDED} guided poses over {RANDOM} random ones, {what}"
-    kinds = {
-        "predicted_within": ("points within a shape, predicted", 1.05),
-        "error_within": ("points within a shape, RMS error", 1.15),
-        "predicted": ("points in camera 1's frame, predicted", None),
-        "error": ("points in camera 1's frame, RMS error", None),
-    }
-    ratios = {kind: (getattr(few, kind) / getattr(many, kind), getattr(best, kind) / getattr(many, kind)) for kind in kinds}
-    return [Row("g", f"{label}: {kinds[kind][0]}", ratio, kinds[kind][1], limit, "") for kind, (ratio, limit) in ratios.items()]
+    ratios = {"guided": GUIDED, "random": RANDOM}
+    for ending, ours in (("", few), ("_steady", best)):
+        ratios |= {f"{name}{ending}": mine / theirs for name, mine, theirs in zip(Errors._fields, ours, many, strict=True)}
+    return ratios
 
 
-def tries(rig: Rig) -> Row:
-    """Row g: the patience that a person needs."""
-    refused = [guided(Session(rig, BoardPrint(), seed)).refused for seed in SEEDS]
-    each = 1 + float(np.mean(refused)) / GUIDED
-    return Row("g", f"poses held for each one kept, {HELD_MM:g} mm and {HELD_DEG:g} deg off", each, None, None, "")
+def tries(setup: Setup) -> Figures:
+    """The patience that a person needs: poses held for each that is kept."""
+    refused = [guided(Session(setup.rig, BoardPrint(), seed)).refused for seed in SEEDS]
+    return {"tries": 1 + np.mean(refused) / GUIDED, "held_mm": HELD_MM, "held_deg": HELD_DEG}
 
 
 def by_guidance(session: Session) -> tuple[Sighting, ...]:
@@ -160,7 +145,7 @@ def held_about(asked: Array, session: Session, rng: np.random.Generator) -> Arra
     raise RuntimeError(f"expected room about the pose asked for, found none within {FARTHER[-1] * HELD_MM:.0f} mm")
 
 
-def figures(sightings: Sequence[Sighting], session: Session) -> Figures:
+def figures(sightings: Sequence[Sighting], session: Session) -> Errors:
     """Calibrate as the command does, and compare with the truth."""
     design, truth = board.design(board.Config()), session.truth
     sizes = {name: camera.size for name, camera in truth.cameras.items()}
@@ -169,7 +154,7 @@ def figures(sightings: Sequence[Sighting], session: Session) -> Figures:
     errors = [point_errors(found, truth, pair, volume) for pair in PAIRS]
     predicted = [uncertainty.triangulation(found, *pair, volume) for pair in PAIRS]
     predicted_within = [uncertainty.shape(found, *pair, volume, volume) for pair in PAIRS]
-    return Figures(
+    return Errors(
         rms_length(np.concatenate(errors)),
         rms_length(np.concatenate([within_shape(error, volume) for error in errors])),
         *(float(np.sqrt(np.trace(np.concatenate(each), axis1=1, axis2=2).mean())) for each in (predicted, predicted_within)),
@@ -182,6 +167,6 @@ def within_shape(errors: Array, volume: Array) -> Array:
     return errors - (modes @ np.linalg.lstsq(modes, errors.ravel(), rcond=None)[0]).reshape(-1, 3)
 
 
-def over_seeds(each: Sequence[Figures]) -> Figures:
+def over_seeds(each: Sequence[Errors]) -> Errors:
     """Root mean squares over several calibrations."""
-    return Figures(*np.sqrt(np.mean(np.square(each), axis=0)).tolist())
+    return Errors(*np.sqrt(np.mean(np.square(each), axis=0)).tolist())

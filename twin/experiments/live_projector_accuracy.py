@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -13,10 +13,10 @@ from recon.devices import pattern_changes, projector_delay
 from recon.devices.interfaces import Frame, Size, Trigger
 from recon.devices.pattern_player import DOUBLED, Stage, Triggered, play
 from recon.devices.projector_window import ProjectorWindow
-from recon.model.patterns import Patterns, Uniform
+from recon.model.patterns import Uniform
 from scenes.catalogue import build_scene
 from twin.experiments import virtual_screen
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting, shoot
 
@@ -24,13 +24,9 @@ TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
 SEEDS = (1, 2)  # of two recordings
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group; those of a display only where Xvfb is."""
-    return [*([lambda: display(setup.sequences)] if virtual_screen.installed() else []), lambda: doubled(setup)]
-
-
-def display(sequences: Mapping[str, Patterns]) -> list[Row]:
-    """Row b: all sequences on displays of their sizes, compared with screenshots; and taken through the player."""
+def display(setup: Setup) -> Figures:
+    """All sequences on displays of their sizes, compared with screenshots; and taken through the player."""
+    sequences = setup.sequences
     sizes = sorted({patterns.projector_size for patterns in sequences.values()})
     exact, taken, delays = [], [], []
     with virtual_screen.running(*(f"{width}x{height}x24" for width, height in sizes)) as desktop, _desktop(desktop):
@@ -49,16 +45,12 @@ def display(sequences: Mapping[str, Patterns]) -> list[Row]:
                 ]
             finally:
                 projector.close()
-    text = f"{len(sequences)} sequences of conf/patterns on a display, {len(exact)} patterns"
-    return [
-        Row("b", f"{text}: share that is pixel-exact", float(np.mean(exact)), 1, 1, "", at_least=True),
-        Row("b", f"{text}: share of the player's images that show theirs", float(np.mean(taken)), 1, 1, "", at_least=True),
-        Row("b", "time from drawing to the virtual screen, largest", 1e3 * max(delays), None, None, "ms"),
-    ]
+    shown = {"sequences": len(sequences), "patterns": len(exact), "exact": np.mean(exact), "taken": np.mean(taken)}
+    return shown | {"delay_ms": 1e3 * max(delays)}
 
 
-def doubled(setup: Setup) -> list[Row]:
-    """Row b: the breast under all sequences of the rig's projector, twice; each pattern as shown, and as the one before."""
+def doubled(setup: Setup) -> Figures:
+    """The breast under all sequences of the rig's projector, twice; each pattern as shown, and as the one before."""
     size, scene = setup.rig.projector.optics.size, build_scene({"kind": "breast"})
     as_shown, as_before = [], []
     for patterns in setup.sequences.values():
@@ -72,14 +64,9 @@ def doubled(setup: Setup) -> list[Row]:
             pair = (shown[k - 1], shown[k])
             as_shown.append(pattern_changes.change(light, (once[k - 1], again[k]), pair))
             as_before.append(pattern_changes.change(light, (once[k - 1], again[k - 1]), pair))
-    found, false = (float(np.mean(np.array(changes) < DOUBLED)) for changes in (as_before, as_shown))
-    text = f"breast, {len(as_shown)} changes of pattern"
-    return [
-        Row("b", f"{text}: share of doubled images found", found, 1, 1, "", at_least=True),
-        Row("b", f"{text}: share of others taken for doubled", false, 0, 0, ""),
-        Row("b", f"{text}: least change, of that expected", float(np.nanmin(as_shown)), DOUBLED, None, "", at_least=True),
-        Row("b", f"{text}: largest of doubled images", float(np.nanmax(as_before)), DOUBLED, None, ""),
-    ]
+    found, false = (np.mean(np.array(changes) < DOUBLED) for changes in (as_before, as_shown))
+    sizes = {"least": np.nanmin(as_shown), "largest_doubled": np.nanmax(as_before), "threshold": DOUBLED}
+    return sizes | {"changes": len(as_shown), "found": found, "false": false}
 
 
 class ScreenCamera:

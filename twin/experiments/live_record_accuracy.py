@@ -4,7 +4,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -26,8 +25,8 @@ from recon.structured_light.triangulate import triangulate
 from scenes.catalogue import build_scene
 from twin.devices.virtual_session import StillSettings, before_scene
 from twin.evaluation import surface_errors
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.surface_accuracy import TRACING, experiment
-from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.optics.surface_session import calibration_of
 
 KILLS, SEED = 20, 5
@@ -46,13 +45,8 @@ with open_recording(Path(sys.argv[1])) as capture, capture.sweep(sys.argv[2], No
 """
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The group's measurements."""
-    return [lambda: surface_rows(setup), kill_rows]
-
-
-def surface_rows(setup: Setup) -> Sequence[Row]:
-    """Row d: RMS error of a recorded surface beside that of a rendered one, of the same scene, rig and exposure."""
+def recorded_surface(setup: Setup) -> Figures:
+    """RMS error of a recorded surface beside that of a rendered one, of the same scene, rig and exposure."""
     patterns, scene = setup.sequences["paper_surface"], {"kind": "breast"}
     made = experiment(setup.rig, build_scene(scene), patterns)
     shown = list(images(patterns))
@@ -68,14 +62,12 @@ def surface_rows(setup: Setup) -> Sequence[Row]:
     cameras, found = calibration_of(setup.rig).cameras, decode(taken, patterns)
     points = clean(triangulate(found, cameras["cam1"], cameras["projector"]), cameras["cam1"], found.modulation)
     compared = surface_errors.compare(points.points, points.sigma, made.truth)
-    figures = surface_errors.measure(points.points, compared, made.truth)
-    recorded, rendered = float(figures["surface_rms_mm"]), float(made.metrics["surface_rms_mm"])
-    text = "breast, recorded from virtual devices beside rendered: relative difference of the surface's RMS error"
-    return [Row("d", text, abs(recorded / rendered - 1), 0.05, None, "")]
+    recorded = surface_errors.measure(points.points, compared, made.truth)["surface_rms_mm"]
+    return {"difference": abs(recorded / made.metrics["surface_rms_mm"] - 1)}
 
 
-def kill_rows() -> Sequence[Row]:
-    """Row d: frames lost or unread after `kill -9` at random moments, and those recorded."""
+def killed(setup: Setup) -> Figures:
+    """Frames lost or unread after `kill -9` at random moments, and those recorded."""
     rng, lost, kept = np.random.default_rng(SEED), 0, 0
     with TemporaryDirectory() as folder:
         capture = Path(folder) / "capture"
@@ -90,11 +82,7 @@ def kill_rows() -> Sequence[Row]:
             whole = {name for name in said if name.endswith("\n")}
             there = _readable(capture, f"s{number}")
             lost, kept = lost + len(whole - there), kept + len(there)
-    text = f"{KILLS} recorders killed by kill -9 at random moments"
-    return [
-        Row("d", f"{text}: frames that were recorded and can't be read", float(lost), 0.0, None, ""),
-        Row("d", f"{text}: frames that are read", float(kept), KILLS, None, "", at_least=True),
-    ]
+    return {"recorders": KILLS, "lost": lost, "read": kept}
 
 
 def _readable(capture: Path, name: str) -> set[str]:

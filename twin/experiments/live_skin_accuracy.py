@@ -21,7 +21,7 @@ from scenes.scene_types import Scene
 from twin.evaluation import light_errors
 from twin.evaluation.light_errors import LightErrors
 from twin.experiments import mass_accuracy, surface_accuracy
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Tracing, render
 from twin.optics.projected_image import ImageLight
@@ -37,59 +37,43 @@ BREAST = {"kind": "breast"}
 MOVED = BREAST | {"middle_mm": [7.0, -4.0], "turn_deg": 2.0}  # by (3, -2) mm and 2 deg
 EYE_MM = (120.0, 150.0, 150.0)  # of a surgeon beside the cameras
 TRACING = Tracing(samples=16, room_lux=20)
-MEDIAN_MM, MOST_MM = 0.3, 0.8  # what is asked, of half and of 95 % of the outline
 RIDGE_PX = 1.7  # smoothing, for lines of 1 mm, 5 px
 SEED = 40
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the part: true masses along the normal and the eye's view, masses found by ultrasound, a phantom that moved."""
-    return [lambda: along_the_normal(setup), lambda: as_the_eye_sees(setup), lambda: after_a_shift(setup), lambda: found(setup)]
+def along_the_normal(setup: Setup) -> Figures:
+    """True masses along the skin's normal, on the measured skin."""
+    return outlines(drawn(setup, BREAST, measured(setup, BREAST), mass_accuracy.tumours(), None, "normal"))
 
 
-def along_the_normal(setup: Setup) -> list[Row]:
-    """Row f: true masses along the skin's normal, on the measured skin."""
-    return rows("along the normal", drawn(setup, BREAST, measured(setup, BREAST), mass_accuracy.tumours(), None, "normal"))
+def as_the_eye_sees(setup: Setup) -> Figures:
+    """The same as a surgeon's eye sees them."""
+    return outlines(drawn(setup, BREAST, measured(setup, BREAST), mass_accuracy.tumours(), EYE_MM, "eye"))
 
 
-def as_the_eye_sees(setup: Setup) -> list[Row]:
-    """Row f: the same as a surgeon's eye sees them."""
-    return rows("from the surgeon's eye", drawn(setup, BREAST, measured(setup, BREAST), mass_accuracy.tumours(), EYE_MM, "eye"))
-
-
-def after_a_shift(setup: Setup) -> list[Row]:
-    """Row f: masses that were found before the phantom moved, moved along by the skin that is measured again."""
+def after_a_shift(setup: Setup) -> Figures:
+    """Masses that were found before the phantom moved, moved along by the skin that is measured again."""
     new = measured(setup, MOVED)
     shift = skin_registration.register(measured(setup, BREAST), new)
     masses = {name: mass.copy().apply_transform(shift.new_from_old) for name, mass in mass_accuracy.tumours().items()}
     pairs = zip(masses.values(), tumours(MOVED).values(), strict=True)
-    off = max(float(np.linalg.norm(mass.center_mass - true.center_mass)) for mass, true in pairs)
+    off = max(np.linalg.norm(mass.center_mass - true.center_mass) for mass, true in pairs)
     sigma = max(shift.sigma_mm(mass.center_mass) for mass in mass_accuracy.tumours().values())
-    what = "phantom moved by 3.6 mm and 2 deg, skin measured again"
-    return [
-        *rows(what, drawn(setup, MOVED, new, masses, None, "moved")),
-        Row("f", f"{what}: masses' centres off from the true ones, largest (limit: predicted sigma)", off, 0.2, sigma, "mm"),
-    ]
+    return outlines(drawn(setup, MOVED, new, masses, None, "moved")) | {"centres_mm": off, "centres_sigma_mm": sigma}
 
 
-def found(setup: Setup) -> list[Row]:
-    """Row f: the whole chain, masses as ultrasound finds them."""
+def found(setup: Setup) -> Figures:
+    """The whole chain, masses as ultrasound finds them."""
     true = mass_accuracy.tumours()
     segmented = mass_accuracy.segmented(setup, mass_accuracy.SEEDS[0])
     nearest = {name: mass_accuracy.nearest(segmented, mesh) for name, mesh in true.items()}
     masses = {name: mass.mesh for name, mass in nearest.items() if mass is not None}
-    errors = drawn(setup, BREAST, measured(setup, BREAST), masses, None, "found")
-    return rows("masses as ultrasound finds them", errors)
+    return outlines(drawn(setup, BREAST, measured(setup, BREAST), masses, None, "found"))
 
 
-def rows(what: str, errors: LightErrors) -> list[Row]:
-    """Rows of a picture's errors."""
-    median, most = np.percentile(errors.all, [50, 95]).tolist()
-    name = f"outlines of three masses in camera 1, {what}"
-    return [
-        Row("f", f"{name}: distance from the true ones, median", median, MEDIAN_MM, None, "mm"),
-        Row("f", f"{name}: the same, 95 %", most, MOST_MM, None, "mm"),
-    ]
+def outlines(errors: LightErrors) -> Figures:
+    """Distances of a picture's light from the true outlines."""
+    return dict(zip(("median_mm", "most_mm"), np.percentile(errors.all, [50, 95]).tolist(), strict=True))
 
 
 def measured(setup: Setup, scene: Spec) -> trimesh.Trimesh:

@@ -11,7 +11,8 @@ from recon.model.rig import Rig
 from recon.structured_light.phase import Noise, wrapped_phase
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.evaluation.surface_errors import rms
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Images, Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
@@ -20,22 +21,10 @@ from twin.optics.ray_world import build_world
 from twin.optics.surface_truth import surface_truth
 
 BLOCK = 4  # px; z-scores are taken of block means, which are close to normal
-EDGES = 1.1  # allowance on the spread of z-scores: blocks with an edge are less normal than smooth ones
-REALISTIC_14 = (-0.11, 0.25, 0.0004, -0.0006, 0.02, 0.01, -0.02, 0.005, 0.001, -0.0005, -0.0008, 0.0004, 0.01, -0.008)
-STRONG_14 = (-0.28, 0.12, 0.002, -0.003, -0.02, 0.05, 0.02, 0.01, 0.004, -0.002, 0.003, 0.001, 0.04, -0.03)
-
-
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size."""
-    rig = setup.rig
-    return [
-        *(
-            lambda kind=kind: against_mitsuba(rig, build_scene({"kind": kind}), 0.5, 32, 16, range(9))
-            for kind in ("plane", "breast")
-        ),
-        lambda: [phase_error(rig, samples=16)],
-        lambda: [round_trip(name, coefficients) for name, coefficients in (("realistic", REALISTIC_14), ("strong", STRONG_14))],
-    ]
+LENSES = {  # coefficients of distortion
+    "realistic": (-0.11, 0.25, 0.0004, -0.0006, 0.02, 0.01, -0.02, 0.005, 0.001, -0.0005, -0.0008, 0.0004, 0.01, -0.008),
+    "strong": (-0.28, 0.12, 0.002, -0.003, -0.02, 0.05, 0.02, 0.01, 0.004, -0.002, 0.003, 0.001, 0.04, -0.03),
+}
 
 
 def paper_surface(projector_size: tuple[int, int]) -> Patterns:
@@ -44,16 +33,11 @@ def paper_surface(projector_size: tuple[int, int]) -> Patterns:
     return Patterns(projector_size=projector_size, unwrap="centre_line", parts=parts)
 
 
-def against_mitsuba(rig: Rig, scene: Scene, scale: float, samples: int, repeats: int, patterns: Sequence[int]) -> list[Row]:
-    """Row a: z-scores of the difference to Mitsuba's `path`, pinholes and direct light."""
-    z = z_scores(*both_renders(rig, scene, scale, samples, repeats, patterns))
+def against_mitsuba(setup: Setup, kind: str, patterns: int, scale: float = 0.5, samples: int = 32, repeats: int = 16) -> Figures:
+    """z-scores of the difference to Mitsuba's `path`, pinholes and direct light."""
+    z = z_scores(*both_renders(setup.rig, build_scene({"kind": kind}), scale, samples, repeats, range(patterns)))
     # Mitsuba's independent samples have nearly all of the variance, so z follows Student's t with repeats - 1 degrees of freedom.
-    spread = float(np.sqrt((repeats - 1) / (repeats - 3)))
-    what = f"{scene.name}, {len(patterns)} patterns"
-    return [
-        Row("a", f"{what}: spread of z-scores against Mitsuba", float(z.std()), EDGES * spread, spread, "sigma"),
-        Row("a", f"{what}: mean z-score against Mitsuba", abs(float(z.mean())), 0.1, 0.0, "sigma"),
-    ]
+    return {"z_spread": z.std(), "spread_of_t": np.sqrt((repeats - 1) / (repeats - 3)), "z_mean": abs(z.mean())}
 
 
 def both_renders(
@@ -87,8 +71,9 @@ def block_means(images: Images) -> NDArray[np.float64]:
     return blocks.mean(axis=(-3, -1), dtype=float)
 
 
-def phase_error(rig: Rig, samples: int) -> Row:
-    """Row c: phase error of a noise-free plane, through distortion, lenses and raster, in projector px."""
+def phase_error(setup: Setup, samples: int) -> Figures:
+    """Phase error of a noise-free plane, through distortion, lenses and raster, in projector px."""
+    rig = setup.rig
     patterns = paper_surface(rig.projector.optics.size)
     world = build_world(build_scene({"kind": "plane", "tilt_deg": [3.0, 12.0]}))
     light = Light.of(patterns, rig.projector)
@@ -99,13 +84,11 @@ def phase_error(rig: Rig, samples: int) -> Row:
     truth = surface_truth(world, rig.cam1.optics.camera(), rig.projector.optics.camera())
     true_phase = 2 * np.pi * (truth.projector[..., 0].astype(float) - fringes.zero(patterns.length("columns"))) / fringes.pitch
     error = np.angle(np.exp(1j * (phase - true_phase))) * fringes.pitch / (2 * np.pi)
-    rms = float(np.sqrt(np.mean(error[truth.lit] ** 2)))
-    return Row("c", f"plane, {samples} samples/px, no noise: RMS phase error", rms, 0.005, None, "projector px")
+    return {"phase_rms_px": rms(error[truth.lit])}
 
 
-def round_trip(name: str, distortion: tuple[float, ...]) -> Row:
-    """Row j: pixel to ray to pixel through 14 coefficients, the largest error in the image."""
-    camera = Camera((1280, 1024), np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]]), np.array(distortion))
+def round_trip(setup: Setup, lens: str) -> Figures:
+    """Pixel to ray to pixel through 14 coefficients, the largest error in the image."""
+    camera = Camera((1280, 1024), np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]]), np.array(LENSES[lens]))
     grid = camera.pixel_grid()
-    error = np.abs(camera.project(camera.rays(grid) * 650.0) - grid).max()
-    return Row("j", f"14 coefficients, {name}: pixel to ray to pixel, largest error", float(error), 1e-3, None, "px")
+    return {"error_px": np.abs(camera.project(camera.rays(grid) * 650.0) - grid).max()}

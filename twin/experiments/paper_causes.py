@@ -14,17 +14,12 @@ from scenes.kinds import plane
 from scenes.scene_types import Scene
 from twin.conditions import Conditions, Drift, Frames, Skin, drifted
 from twin.experiments import surface_accuracy
-from twin.experiments.plane_and_sphere import Measured, as_published, conditions_of, measured
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.plane_and_sphere import Measured, as_published, measured
 from twin.experiments.surface_accuracy import Experiment
-from twin.experiments.table_rows import Row, Setup
 from twin.optics.surface_session import Shooting, calibration_of
 
 SEEDS = range(320, 323)
-FIGURES = {
-    "planes, RMS (paper: 0.101 to 0.131)": "plane_rms_mm",
-    "sphere, RMS (paper: 0.04)": "sphere_rms_mm",
-    "sphere, radius error (paper: 0.045)": "radius_error_mm",
-}
 
 
 class Cause(NamedTuple):
@@ -34,16 +29,14 @@ class Cause(NamedTuple):
     light: float = 1.0  # of that which fills the range of the images
 
 
-def rows(setup: Setup) -> list[Row]:
-    """Row h: RMS of planes, RMS and radius error of the sphere, as published and by our decoding."""
-    made = []
-    for name, cause in causes(conditions_of(setup)).items():
-        ours, published = zip(*(compared(setup, cause, seed) for seed in SEEDS), strict=True)
-        for decoding, results in (("decoded as published", published), ("decoded by us", ours)):
-            for what, figure in FIGURES.items():
-                value = float(np.mean([abs(getattr(one, figure)) for one in results]))
-                made.append(Row("h", f"true calibration, {name}, {decoding}: {what}", value, None, None, "mm"))
-    return made
+def one_cause(setup: Setup, cause: str) -> Figures:
+    """RMS of planes, RMS and radius error of the sphere, as published and by our decoding."""
+    by_us, published = zip(*(compared(setup, causes(setup.lifelike)[cause], seed) for seed in SEEDS), strict=True)
+    return {
+        f"{name} {decoding}": np.mean([abs(getattr(one, name)) for one in results])
+        for decoding, results in (("as published", published), ("by us", by_us))
+        for name in ("plane_rms_mm", "sphere_rms_mm", "radius_error_mm")
+    }
 
 
 def causes(life: Conditions) -> Mapping[str, Cause]:

@@ -10,11 +10,9 @@ from recon.model.patterns import Fringes, Patterns
 from recon.structured_light.phase import wrapped_phase
 from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import triangulate
-from twin.conditions import Conditions
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import rms
 from twin.experiments.surface_accuracy import Experiment
-from twin.experiments.table_rows import Setup
 
 Array = NDArray[np.float64]
 
@@ -65,13 +63,6 @@ def form_rms(points: Array) -> float:
     plain = [k for k, (i, j) in enumerate(FORM_POWERS) if i + j <= 1]
     smooth = powers @ solved
     return rms(smooth - powers[:, plain] @ np.linalg.lstsq(powers[:, plain], smooth, rcond=None)[0])
-
-
-def conditions_of(setup: Setup) -> Conditions:
-    """Conditions of life; ValueError if the setup has none."""
-    if setup.lifelike is None:
-        raise ValueError("setup.lifelike: expected those of conf/conditions/lifelike.yaml, found none")
-    return setup.lifelike
 
 
 def as_published(shot: Experiment, patterns: Patterns) -> Experiment:

@@ -11,11 +11,13 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter
+from recon.tracking import networks as nets
 from recon.tracking.networks import DETECTOR_SIZE, Networks
 from recon.tracking.tracker import Tracker
 from twin.experiments import tracking_frames
 from twin.experiments.baselines import published
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
+from twin.experiments.tracking_frames import exactly_printed
 from twin.sensor import Exposure, noise_dn, number_per_electron
 from twin.tracking.rendered_views import Frames
 from twin.tracking.samples import Take
@@ -29,7 +31,6 @@ Locate = Callable[[Pair, Images], Array | None]  # from two frames to world_from
 SEED = 2002
 LIT_DN, COUNT, BLURRED = 120.0, 40, 12  # frames of the static study, and of each other blur
 FINE = 64  # rays a pixel, so that rendering's noise is small beside the sensor's where covariances are tested
-BLURS = (4.0, 8.0, 12.0, 16.0)
 
 
 @dataclass(frozen=True)
@@ -43,52 +44,45 @@ class Located:
     misfit: float  # squared error of the pose over its covariance, chi-square with 6 degrees; NaN if not found
 
 
-def centre_rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Median errors of centres in motion."""
-    result = []
-    for blur in BLURS:
-        shown = tracking_frames.study(setup, SEED, BLURRED, LIT_DN, blur)
-        errors = [located(take, given, setup.rig.target, networks) for take, given in shown]
-        result.append(centre_row(blur, errors, 0.15 if blur <= 12 else 0.25))
-    return result
+def moving_centres(setup: Setup, blur_px: float) -> Figures:
+    """Median error of centres in motion."""
+    setup, known = exactly_printed(setup), nets.load()
+    shown = tracking_frames.study(setup, SEED, BLURRED, LIT_DN, blur_px)
+    return centres([located(take, given, setup.rig.target, known) for take, given in shown])
 
 
-def centre_row(blur: float, errors: Sequence[Located], bar: float) -> Row:
+def centres(errors: Sequence[Located]) -> Figures:
     """Median error of centres, beside that of noise alone."""
-    centres = np.concatenate([one.centre_px for one in errors])
-    limit = np.concatenate([one.limit_px for one in errors])
-    share = 100 * np.isfinite(centres).mean()
-    what = f"centre error at {blur:g} px blur, white 120, median of {len(centres)} circles ({share:.0f} % found)"
-    return Row("c", what, float(np.nanmedian(centres)), bar, float(np.median(limit)), "px")
+    found = np.concatenate([one.centre_px for one in errors])
+    limit = np.median(np.concatenate([one.limit_px for one in errors]))
+    share = 100 * np.isfinite(found).mean()
+    return {"centre_px": np.nanmedian(found), "limit_px": limit, "circles": len(found), "circles_percent": share}
 
 
-def pose_rows(setup: Setup, networks: Networks) -> list[Row]:
+def poses_at_rest(setup: Setup) -> Figures:
     """Errors of centres and poses, static and lit, over the working volume; whether covariances hold; the published recipe's."""
+    setup, known = exactly_printed(setup), nets.load()
     sample = list(tracking_frames.study(setup, SEED, COUNT, LIT_DN, 0.0, FINE))
-    target = setup.rig.target
-    errors = [located(take, given, target, networks) for take, given in sample]
-    recipe = [pose_errors(take, published_recipe(networks)(cameras_of(take), given.views)) for take, given in sample]
-    shift, turn = np.array([one.shift_mm for one in errors]), np.array([one.turn_deg for one in errors])
+    errors = [located(take, given, setup.rig.target, known) for take, given in sample]
+    recipe = [pose_errors(take, published_recipe(known)(cameras_of(take), given.views)) for take, given in sample]
+    shift, turn, misfit = (np.array([getattr(one, name) for one in errors]) for name in ("shift_mm", "turn_deg", "misfit"))
     theirs = np.array([(np.nan, np.nan) if one is None else one for one in recipe])
     both = np.isfinite(shift) & np.isfinite(theirs[:, 0])
     ratio = np.median(theirs[both], axis=0) / [np.median(shift[both]), np.median(turn[both])]
-    misfit = np.array([one.misfit for one in errors])
-    known = misfit[np.isfinite(misfit)]
-    of = f"static, lit, {len(sample)} poses"
-    inside = 100 * np.mean(known < chi2.ppf(0.95, 6))
-    return [
-        centre_row(0.0, errors, 0.02),
-        Row("d", f"translation, {of}: median", float(np.nanmedian(shift)), 0.04, None, "mm"),
-        Row("d", f"translation, {of}: 95th percentile", float(np.nanpercentile(shift, 95)), 0.10, None, "mm"),
-        Row("d", f"rotation, {of}: median", float(np.nanmedian(turn)), 0.08, None, "deg"),
-        Row("d", f"rotation, {of}: 95th percentile", float(np.nanpercentile(turn, 95)), 0.20, None, "deg"),
-        Row("d", f"poses found, {of}", 100 * np.isfinite(shift).mean(), 99.0, None, "%", at_least=True),
-        Row("d", "squared error over covariance, chi-square of 6: mean", float(known.mean()), 7.5, 6.0, ""),
-        Row("d", "errors within the 95 % region that the covariance gives", float(inside), 90.0, 95.0, "%", at_least=True),
-        Row("e", f"published recipe, same frames and networks ({both.sum()} found by both): translation, median, times ours",
-            float(ratio[0]), 2.0, None, "x", at_least=True),
-        Row("e", "published recipe: rotation, median, times ours", float(ratio[1]), 2.0, None, "x", at_least=True),
-    ]  # fmt: skip
+    misfit = misfit[np.isfinite(misfit)]
+    return centres(errors) | {
+        "poses": len(sample),
+        "shift_mm": np.nanmedian(shift),
+        "shift_mm_95": np.nanpercentile(shift, 95),
+        "turn_deg": np.nanmedian(turn),
+        "turn_deg_95": np.nanpercentile(turn, 95),
+        "found_percent": 100 * np.isfinite(shift).mean(),
+        "squared": misfit.mean(),
+        "inside_percent": 100 * np.mean(misfit < chi2.ppf(0.95, 6)),
+        "both": both.sum(),
+        "recipe_shift": ratio[0],
+        "recipe_turn": ratio[1],
+    }
 
 
 def located(take: Take, given: Frames, target: Target, networks: Networks) -> Located:

@@ -16,7 +16,7 @@ from recon.probe_calibration import point_calibration, repeatability, sound_in_w
 from recon.probe_calibration.point_calibration import Adjustment, Noise, Sightings
 from scenes.acoustics import TISSUES
 from scenes.kinds import crosswire
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import Body, body
 from twin.ultrasound.probe_path import WirePath, about_crossing, held
@@ -33,14 +33,11 @@ WRONG = 0.3  # share of outliers
 REGION = 0.95
 TEMPERATURE_C = 22.0  # of the scene's water
 DEPTH_MM = 50.0  # shown, at which depths are compared
+ERROR_MM = 0.3  # of a calibration, at most
 WIRE_MM = 0.1  # radius of the scene's wires
 FEW = 20  # frames of a motion that is to be refused
 ALMOST_MM = 1e-3  # noise of a crossing that is known
-PAPER = {"CR1": (0.434, 0.551, 0.591), "CR2": (0.274, 0.345, 0.368)}  # mm
-BARS = {"CR1": (0.20, 0.25, 0.30), "CR2": (0.13, 0.17, 0.20)}  # mm
-PLACES = ("centre", "corners, mean of four", "mean of five points")
-PAPER_AT = ("", ", one corner", "")
-TRUE_MM = 0.30
+REPEATED = [f"{name}_{place}" for name in ("cr1", "cr2") for place in ("centre", "corners", "mean")]
 LEFT_HANDED, X_AND_Y = np.diag([1.0, 1, -1, 1]), np.eye(4)[[1, 0, 2, 3]]
 
 
@@ -53,16 +50,6 @@ class Frames:
     numbers: NDArray[np.int64]  # (m,) of these frames
     pixels: Array  # (n, 2) px, true: the crossing, projected into the image plane
     beside: Array  # (n,) mm, true: of the crossing from the image plane
-
-
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size."""
-    return [
-        lambda: repeats(setup, recorded(setup.rig, setup.scanners["water"])),
-        lambda: outliers(setup, recorded(setup.rig, setup.scanners["water"])),
-        lambda: refusals(setup, recorded(setup.rig, setup.scanners["water"])),
-        lambda: sound(setup, recorded(setup.rig, setup.scanners["water"])),
-    ]
 
 
 @cache
@@ -130,10 +117,10 @@ def errors(found: Sequence[ProbeCalibration], truth: ProbeCalibration, rig: Rig)
 
 
 def repeatabilities(found: Sequence[ProbeCalibration], rig: Rig) -> Array:
-    """CR1 and CR2 : (2, 3) mm at PLACES."""
+    """REPEATED : (6,) mm."""
     points = repeatability.five_points(rig.probe.image_size)
     both = np.stack([repeatability.cr1(found, points), repeatability.cr2(found, points)])
-    return np.column_stack([both[:, 0], both[:, 1:].mean(axis=1), both.mean(axis=1)])
+    return np.column_stack([both[:, 0], both[:, 1:].mean(axis=1), both.mean(axis=1)]).ravel()
 
 
 def squared_length(found: ProbeCalibration, truth: ProbeCalibration) -> float:
@@ -155,40 +142,27 @@ def sets(rig: Rig, frames: Frames) -> tuple[list[list[Adjustment]], list[list[Pr
     return by_images, exact
 
 
-def repeats(setup: Setup, frames: Frames) -> list[Row]:
-    """Row d: five calibrations agree, and are right; the limit is that of the poses' errors alone."""
+def taken(setup: Setup) -> Frames:
+    """B-scans of the protocol."""
+    return recorded(setup.rig, setup.scanners["water"])
+
+
+def repeats(setup: Setup, frames: Frames | None = None) -> Figures:
+    """Five calibrations agree, and are right; the limit is that of the poses' errors alone."""
+    frames = frames or taken(setup)
     rig, truth = setup.rig, in_water(setup)
     by_images, exact = sets(rig, frames)
     found = [[each.calibration for each in one] for one in by_images]
-    figures = np.mean([repeatabilities(one, rig) for one in found], axis=0)
-    limits = np.mean([repeatabilities(one, rig) for one in exact], axis=0)
-    used = np.mean([(~each.outliers).sum() for one in by_images for each in one])
-    what = f"{len(found[0])} calibrations x {IMAGES} images ({used:.1f} used)"
-    rows = [
-        Row(
-            "d",
-            f"{what}: {name}, {place} (paper{PAPER_AT[k]}: {PAPER[name][k]})",
-            figures[n, k],
-            BARS[name][k],
-            limits[n, k],
-            "mm",
-        )
-        for n, name in enumerate(("CR1", "CR2"))
-        for k, place in enumerate(PLACES)
-    ]
-    flat, perfect = ([each for one in many for each in one] for many in (found, exact))
-    error, limit = errors(flat, truth, rig), errors(perfect, truth, rig)
-    many = f"{len(flat)} calibrations, worst of five points: true error"
-    rows.append(Row("d", f"{many}, median", float(np.median(error.max(1))), TRUE_MM, float(np.median(limit.max(1))), "mm"))
-    rows.append(Row("d", f"{many}, worst", float(error.max()), TRUE_MM, float(limit.max()), "mm"))
-    ratio = sum(squared_length(each, truth) for each in flat) / (8 * len(flat))
+    figures: Figures = {"set": len(found[0]), "used": np.mean([(~each.outliers).sum() for one in by_images for each in one])}
+    for ending, many in (("mm", found), ("limit_mm", exact)):
+        values = np.mean([repeatabilities(one, rig) for one in many], axis=0)
+        worst = errors([each for one in many for each in one], truth, rig).max(axis=1)
+        figures |= {f"{name}_{ending}": value for name, value in zip(REPEATED, values, strict=True)}
+        figures |= {f"error_{ending}": np.median(worst), f"worst_{ending}": worst.max(), "calibrations": len(worst)}
+    squared = sum(squared_length(each, truth) for one in found for each in one) / (8 * figures["calibrations"])
     freedom = 8 * len(found[0])  # repeats share their images, so only sets of these count as independent
     low, high = chi2.ppf([(1 - REGION) / 2, (1 + REGION) / 2], freedom) / freedom
-    shared = f"{len(flat)} calibrations of {len(found[0])} sets of images, {100 * REGION:.0f} % interval of {len(found[0])}"
-    honest = f"{shared}: squared error of the parameters over its expectation"
-    rows.append(Row("d", f"{honest}, at least", ratio, low, 1.0, "", at_least=True))
-    rows.append(Row("d", f"{honest}, at most", ratio, high, 1.0, ""))
-    return rows
+    return figures | {"squared_error": squared, "low": low, "high": high}
 
 
 def with_outliers(sightings: Sightings, size: tuple[int, int], rng: np.random.Generator) -> Sightings:
@@ -199,8 +173,9 @@ def with_outliers(sightings: Sightings, size: tuple[int, int], rng: np.random.Ge
     return replace(sightings, pixels=pixels)
 
 
-def outliers(setup: Setup, frames: Frames) -> list[Row]:
-    """Row e: the same with 30 % of the crossings anywhere, over row d; the limit is that of so many fewer frames."""
+def outliers(setup: Setup, frames: Frames | None = None) -> Figures:
+    """The same with 30 % of the crossings anywhere, over those without; the limit is that of so many fewer frames."""
+    frames = frames or taken(setup)
     rig, truth = setup.rig, in_water(setup)
     clean = [[each.calibration for each in one] for one in sets(rig, frames)[0]]
     spoilt = []
@@ -209,21 +184,14 @@ def outliers(setup: Setup, frames: Frames) -> list[Row]:
         ones = [with_outliers(frames.found.of(block), rig.probe.image_size, draw) for block in blocks(frames)]
         spoilt.append([calibrated(rig, one, rng).calibration for one in ones])
     ratio = np.mean([repeatabilities(one, rig) for one in spoilt], 0) / np.mean([repeatabilities(one, rig) for one in clean], 0)
-    limit = (1 - WRONG) ** -0.5
-    what = f"{100 * WRONG:.0f} % outliers, over those without"
-    rows = [
-        Row("e", f"{what}: {name}, {place}", ratio[n, k], 1.5, limit, "")
-        for n, name in enumerate(("CR1", "CR2"))
-        for k, place in enumerate(PLACES)
-    ]
     after, before = (errors([each for one in many for each in one], truth, rig).max(axis=1) for many in (spoilt, clean))
-    rows.append(Row("e", f"{what}: true error, median", float(np.median(after) / np.median(before)), 1.5, limit, ""))
-    rows.append(Row("e", f"{what}: true error, worst", float(after.max() / before.max()), 1.5, limit, ""))
-    return rows
+    figures = dict(zip(REPEATED, ratio, strict=True)) | {"limit": (1 - WRONG) ** -0.5}
+    return figures | {"error": np.median(after) / np.median(before), "worst": after.max() / before.max()}
 
 
-def refusals(setup: Setup, frames: Frames) -> list[Row]:
-    """Row e: motions and axes from which nothing can follow are refused, by their names."""
+def refusals(setup: Setup, frames: Frames | None = None) -> Figures:
+    """Motions and axes from which nothing can follow are refused, by their names: 1 for each that is."""
+    frames = frames or taken(setup)
     rig, rng = setup.rig, np.random.default_rng(3)
     upper = frames.found.pixels[:, 1] < rig.probe.image_size[1] / 2
     block = frames.found.of(blocks(frames)[0])
@@ -239,16 +207,13 @@ def refusals(setup: Setup, frames: Frames) -> list[Row]:
         return point_calibration.calibrate(replace(block, poses=poses), rig.probe.image_size)
 
     cases: dict[str, tuple[Callable[[], object], str]] = {
-        "a planar motion": (lambda: calibrated(rig, planar(setup), rng), "planar motion"),
-        "one depth only": (lambda: calibrated(rig, frames.found.of(upper), rng), "one depth only"),
-        "axes of the target swapped": (turned(X_AND_Y @ LEFT_HANDED), "axes are swapped"),
-        "translations of the wrong handedness": (shifted, "wrong handedness"),
-        "rotations of the wrong handedness": (turned(LEFT_HANDED), "left-handed"),
+        "planar": (lambda: calibrated(rig, planar(setup), rng), "planar motion"),
+        "depth": (lambda: calibrated(rig, frames.found.of(upper), rng), "one depth only"),
+        "swapped": (turned(X_AND_Y @ LEFT_HANDED), "axes are swapped"),
+        "mirrored": (shifted, "wrong handedness"),
+        "left_handed": (turned(LEFT_HANDED), "left-handed"),
     }
-    return [
-        Row("e", f"{what}: refused, and named", refused(make, named), 1.0, 1.0, "", at_least=True)
-        for what, (make, named) in cases.items()
-    ]
+    return {name: refused(make, named) for name, (make, named) in cases.items()}
 
 
 def planar(setup: Setup) -> Sightings:
@@ -270,32 +235,17 @@ def refused(make: Callable[[], object], named: str) -> float:
     return 0.0
 
 
-def sound(setup: Setup, frames: Frames) -> list[Row]:
-    """Row f: the error of depths in water of 22 degrees, as predicted, and after its correction by the temperature."""
+def sound(setup: Setup, frames: Frames | None = None) -> Figures:
+    """The error of depths in water of 22 degrees, as predicted, and after its correction by the temperature."""
+    frames = frames or taken(setup)
     rig, truth = setup.rig, calibration_of(setup.rig, setup.scanners["water"])
     speed = float(sound_in_water.speed_of_sound(TEMPERATURE_C))
     found = [each.calibration for each in sets(rig, frames)[0][0]]
-    mean = repeatability.average(found)
-    seen, sigma = sound_in_water.implied_speed(mean, truth.scale[1])
+    seen, sigma = sound_in_water.implied_speed(repeatability.average(found), truth.scale[1])
     predicted = float(sound_in_water.shown_too_deep(DEPTH_MM, speed))
     deep = float(sound_in_water.shown_too_deep(DEPTH_MM, seen))
     undone = [sound_in_water.in_medium(each, speed, sound_in_water.SCANNER_SPEED) for each in found]
     before, after = errors(found, truth, rig).max(axis=1), errors(undone, truth, rig).max(axis=1)
-    where = f"water of {TEMPERATURE_C:g} deg C, {DEPTH_MM:g} mm shown"
-    shown = f"{where}: predicted {predicted:.2f} mm too deep, {deep:.2f} found by {len(found)} calibrations; difference"
-    limit = DEPTH_MM * sigma / sound_in_water.SCANNER_SPEED
-    five = f"{len(found)} calibrations, worst of five points"
-    return [
-        Row("f", shown, abs(deep - predicted), 3 * limit, limit, "mm"),
-        Row(
-            "f",
-            f"{five}: error for tissue, as calibrated, least",
-            before.min(),
-            predicted - TRUE_MM,
-            predicted,
-            "mm",
-            at_least=True,
-        ),
-        Row("f", f"{five}: error for tissue, converted by the temperature, median", float(np.median(after)), TRUE_MM, None, "mm"),
-        Row("f", f"{five}: error for tissue, converted by the temperature, worst", after.max(), TRUE_MM, None, "mm"),
-    ]
+    figures = {"calibrations": len(found), "predicted_mm": predicted, "found_mm": deep, "difference_mm": abs(deep - predicted)}
+    figures |= {"limit_mm": DEPTH_MM * sigma / sound_in_water.SCANNER_SPEED, "before_mm": before.min()}
+    return figures | {"least_before_mm": predicted - ERROR_MM, "after_mm": np.median(after), "worst_after_mm": after.max()}

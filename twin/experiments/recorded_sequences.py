@@ -13,14 +13,14 @@ from recon.freehand import plus_config, sequences
 from recon.freehand.sequences import Frames
 from recon.geometry import rigid
 from recon.model import probe
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 
 SWEEP = "SpinePhantomFreehand.igs.mha"
 LEVELS = 2  # grey levels
 
 
-def real_sweep(setup: Setup) -> list[Row]:
-    """Row j: a recorded sweep over a spine phantom, reconstructed as its configuration says."""
+def real_sweep(setup: Setup) -> Figures:
+    """A recorded sweep over a spine phantom, reconstructed as its configuration says."""
     assert setup.real is not None
     folder = setup.real / "tracked_sweep"
     config = plus_config.read_config(folder / "config_NN_MEAN.xml")
@@ -30,47 +30,24 @@ def real_sweep(setup: Setup) -> list[Row]:
     pasted, whole = plus_config.reconstruct_sequence(folder / SWEEP, config)
     seconds = perf_counter() - start
     same = pasted.volume.voxels.shape == reference.voxels.shape
-    off = float(np.abs(pasted.volume.origin - reference.origin).max())
+    off = np.abs(pasted.volume.origin - reference.origin).max()
     alike = np.abs(whole.volume.voxels.astype(int) - reference.voxels) <= LEVELS if same else np.zeros(1, bool)
     seen, filled = (alike[pasted.filled], alike[whole.filled & ~pasted.filled]) if same else (alike, alike)
-    text = f"recorded sweep, {'x'.join(str(n) for n in pasted.volume.voxels.shape[::-1])} voxels"
-    return [
-        Row("j", f"{text}: has the size of the reference volume", float(same), 1, 1, "", at_least=True),
-        Row("j", f"{text}: origin off", off, 1e-3, 5e-4, "mm"),
-        Row(
-            "j",
-            f"{text}: share within {LEVELS} grey levels, before holes are filled",
-            float(seen.mean()),
-            0.97,
-            1,
-            "",
-            at_least=True,
-        ),
-        Row(
-            "j",
-            f"{text}: share within {LEVELS} grey levels, of the filled holes",
-            float(filled.mean()),
-            0.97,
-            1,
-            "",
-            at_least=True,
-        ),
-        Row("j", f"{text}: time, read, paste and fill", seconds, 5.0, None, "s"),
-    ]
+    depth, height, width = pasted.volume.voxels.shape
+    figures = {"same_size": same, "off_mm": off, "pasted_alike": seen.mean(), "filled_alike": filled.mean(), "seconds": seconds}
+    return figures | {"width": width, "height": height, "depth": depth}
 
 
-def round_trip(seed: int = 1) -> list[Row]:
-    """Row k: sequences of random images, poses and times are the same after writing and reading, to the last bit."""
+def round_trip(setup: Setup, seed: int = 1) -> Figures:
+    """Sequences of random images, poses and times are the same after writing and reading, to the last bit."""
     rng = np.random.default_rng(seed)
     with TemporaryDirectory() as folder:
         same = [_equal(written, sequences.read_sequence(path)) for path, written in _written(Path(folder), rng)]
-    return [
-        Row("k", f"{len(same)} sequences written and read: share that is the same", float(np.mean(same)), 1, 1, "", at_least=True)
-    ]
+    return {"sequences": len(same), "same": np.mean(same)}
 
 
-def damaged(seed: int = 1) -> list[Row]:
-    """Row k: files cut in half, a bad transform and a NaN are refused in one line that names the file."""
+def damaged(setup: Setup, seed: int = 1) -> Figures:
+    """Files cut in half, a bad transform and a NaN are refused in one line that names the file."""
     rng = np.random.default_rng(seed)
     refused = []
     with TemporaryDirectory() as folder:
@@ -80,18 +57,16 @@ def damaged(seed: int = 1) -> list[Row]:
             for content in (whole[: len(whole) // 2], whole.replace(number, b"", 1), whole.replace(number, b"nan", 1)):
                 path.write_bytes(content)
                 refused.append(_refusal(path))
-    return [
-        Row("k", f"{len(refused)} damaged sequences: share refused in one line", float(np.mean(refused)), 1, 1, "", at_least=True)
-    ]
+    return {"sequences": len(refused), "refused": np.mean(refused)}
 
 
-def real_file(setup: Setup) -> list[Row]:
-    """Row k: the recorded sweep is read whole."""
+def real_file(setup: Setup) -> Figures:
+    """The recorded sweep is read whole."""
     assert setup.real is not None
     frames = sequences.read_sequence(setup.real / "tracked_sweep" / SWEEP)
     assert frames.images is not None
     placed = np.isfinite(sequences.poses(frames, "Reference", "Probe")).all(axis=(1, 2))
-    return [Row("k", "recorded sweep: images with a pose", int(placed.sum()), 21, 21, "", at_least=True)]
+    return {"placed": placed.sum()}
 
 
 def _written(folder: Path, rng: np.random.Generator) -> Iterator[tuple[Path, Frames]]:

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from recon.files import atomic
 from recon.model.rig import Target
 from recon.reports.figures import SEQUENTIAL
+from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.pose import estimate
 from recon.tracking.pose_fit import Sighting
 from recon.tracking.tracker import Tracker
 from twin.experiments import tracking_frames
 from twin.experiments.baselines import classical, fiducials
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.pose_accuracy import Images, Locate, Pair, cameras_of, pose_errors
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.tracking_frames import exactly_printed
 from twin.tracking.surface_prints import BitGrid
 
 Array = NDArray[np.float64]
@@ -66,13 +68,14 @@ def choices(target: Target, networks: Networks) -> list[Choice]:
     ]
 
 
-def rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Summaries of the grid, of which nothing is asked; a figure of all its cells in `setup.out`."""
-    alike = groupby(choices(setup.rig.target, networks), key=lambda choice: id(choice.face))
+def grid(setup: Setup) -> Figures:
+    """Summaries of the grid; a figure of all its cells in `setup.out`."""
+    setup = exactly_printed(setup)
+    alike = groupby(choices(setup.rig.target, nets.load()), key=lambda choice: id(choice.face))
     tried = [one for _, some in alike for one in over_grid(setup, list(some))]
     if setup.out is not None:
         draw(tried, setup.out / FIGURE)
-    return [row for one in tried for row in summary(one)]
+    return {f"{one.name}: {name}": value for one in tried for name, value in summary(one).items()}
 
 
 def over_grid(setup: Setup, alike: Sequence[Choice]) -> list[Tried]:
@@ -87,25 +90,12 @@ def over_grid(setup: Setup, alike: Sequence[Choice]) -> list[Tried]:
     return [Tried(choice.name, one[..., 0], one[..., 1]) for choice, one in zip(alike, errors, strict=True)]
 
 
-def summary(tried: Tried) -> list[Row]:
-    """Detection rates, everywhere, in the dark and when blurred; errors at rest in good light."""
+def summary(tried: Tried) -> Figures:
+    """Detection rates, everywhere, in the dark and when blurred; errors at rest in good light, if there are any."""
     dark, blurred, lit = np.array(WHITES) <= DARK_DN, np.array(BLURS) >= BLURRED_PX, np.array(WHITES) >= LIT_DN
-    still = tried.shift_mm[lit, 0], tried.turn_deg[lit, 0]
-    shares = {
-        "found, all cells": tried.found,
-        f"found, white {min(WHITES):g} and {DARK_DN:g}": tried.found[dark],
-        f"found, blur {BLURRED_PX:g} and {max(BLURS):g} px": tried.found[:, blurred],
-    }
-    exact = [("translation", "mm", still[0]), ("rotation", "deg", still[1])]
-    where = f"at rest, white {LIT_DN:g} and more, median"
-    return [
-        *(Row("f", f"{tried.name}: {what}", float(share.mean()), None, None, "%") for what, share in shares.items()),
-        *(
-            Row("f", f"{tried.name}: {what} {where}", float(np.nanmedian(values)), None, None, unit)
-            for what, unit, values in exact
-            if np.isfinite(values).any()
-        ),
-    ]
+    found, exact = tried.found, {"shift_mm": tried.shift_mm[lit, 0], "turn_deg": tried.turn_deg[lit, 0]}
+    shares = {"found": found.mean(), "found_dark": found[dark].mean(), "found_blurred": found[:, blurred].mean()}
+    return shares | {name: np.nanmedian(values) for name, values in exact.items() if np.isfinite(values).any()}
 
 
 def draw(tried: Sequence[Tried], path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from recon.optical_calibration.joint_calibration import Result, Settings, Shape,
 from twin.experiments.board_accuracy import misshapen
 from twin.experiments.board_sets import BoardSet, drawn
 from twin.experiments.calibration_errors import DEPTHS, point_errors
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.surface_session import calibration_of
 
 Array = NDArray[np.float64]
@@ -45,26 +44,19 @@ class Scaled:
     designed: float  # error of the scale with the board taken as designed
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """Row a: the scale of calibrations with drawn boards."""
-    return [partial(down, setup.rig)]
-
-
-def down(rig: Rig) -> list[Row]:
+def drawn_boards(setup: Setup) -> Figures:
     """The scale's errors over what is stated of them, and beside those of boards taken as designed."""
-    found = [calibrated(rig, seed) for seed in BOARDS]
+    found = [calibrated(setup.rig, seed) for seed in BOARDS]
     accepted = [one for one in found if one is not None]
     error, sigma, designed = np.array([(one.error, one.sigma, one.designed) for one in accepted]).T
-    what = f"{len(found)} boards"
-    return [
-        Row("a", f"{what}: refused", len(found) - len(accepted), None, None, ""),
-        Row(
-            "a", f"{what}: scale within 3 stated sigma, at least", float(np.mean(abs(error) <= 3 * sigma)), 0.99, 0.997, "", True
-        ),
-        Row("a", f"{what}: worse than as designed by more than a stated sigma", worse(accepted), 0, 0, ""),
-        Row("a", f"{what}: error of the scale, largest", 100 * float(abs(error).max()), None, None, "%"),
-        Row("a", f"{what}, taken as designed: error of the scale, largest", 100 * float(abs(designed).max()), None, None, "%"),
-    ]
+    return {
+        "boards": len(found),
+        "refused": len(found) - len(accepted),
+        "within": np.mean(abs(error) <= 3 * sigma),
+        "worse": worse(accepted),
+        "error_percent": 100 * abs(error).max(),
+        "designed_percent": 100 * abs(designed).max(),
+    }
 
 
 def worse(found: list[Scaled]) -> int:

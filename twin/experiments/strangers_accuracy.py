@@ -1,10 +1,8 @@
 """Recordings of strangers: other scanners, probes and brackets, of which nothing is known beforehand, and real ones at hand."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from recon.clips import fan_region
@@ -15,9 +13,9 @@ from recon.probe_calibration import latency, point_calibration, repeatability, s
 from recon.probe_calibration.point_calibration import Noise
 from scenes.catalogue import build_scene
 from scenes.kinds import crosswire
-from twin.experiments import probe_accuracy, recorded_sequences, surface_accuracy
+from twin.experiments import probe_accuracy
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.probe_accuracy import SHIFT_MM, TEMPERATURE_C, TURN_DEG, WIRE_MM
-from twin.experiments.table_rows import Measurement, Row, Setup
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import scans
 from twin.ultrasound.echo_solids import body
@@ -40,19 +38,8 @@ FAN_DEPTH_MM = 100.0
 LAG_S = 0.07
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size; rows of recordings only where they are at hand."""
-    return [
-        lambda: foreign_probes(setup),
-        lambda: fans(setup),
-        lambda: curved_lag(setup),
-        *([lambda: surface_accuracy.real_capture(setup)] if setup.real else []),
-        *([lambda: recorded_sequences.real_sweep(setup)] if setup.real else []),
-    ]
-
-
-def foreign_probes(setup: Setup) -> list[Row]:
-    """Point 5: probes of other scanners on other brackets, calibrated without a design, from the twin's crossed wires."""
+def foreign_probes(setup: Setup) -> Figures:
+    """Probes of other scanners on other brackets, calibrated without a design, from the twin's crossed wires."""
     rng = np.random.default_rng(SEED)
     wired, errors, sigmas = body(crosswire.build(crosswire.Config(diameter_mm=2 * WIRE_MM))), [], []
     for size, extent_mm, mhz in SCANNERS:
@@ -69,12 +56,8 @@ def foreign_probes(setup: Setup) -> list[Row]:
         in_water = sound_in_water.in_medium(truth, truth.speed_m_s, float(sound_in_water.speed_of_sound(TEMPERATURE_C)))
         errors.append(np.linalg.norm(found.to_target(points) - in_water.to_target(points), axis=1))
         sigmas.append(np.sqrt(np.trace(point_calibration.point_covariance(found, points), axis1=1, axis2=2)))
-    what = f"{len(SCANNERS)} foreign probes, no design known, {IMAGES} images each: five points"
-    ratio = np.array(errors) / np.array(sigmas)
-    return [
-        Row("5", f"{what}, worst error", float(np.max(errors)), 0.6, float(np.max(sigmas)), "mm"),
-        Row("5", f"{what}, worst error over its predicted sigma", float(ratio.max()), 3.5, None, ""),
-    ]
+    worst = {"error_mm": np.max(errors), "sigma_mm": np.max(sigmas), "ratio": (np.array(errors) / np.array(sigmas)).max()}
+    return worst | {"probes": len(SCANNERS), "images": IMAGES}
 
 
 def _on_a_bracket(rig: Rig, array: Transducer, rng: np.random.Generator) -> Rig:
@@ -88,8 +71,8 @@ def _on_a_bracket(rig: Rig, array: Transducer, rng: np.random.Generator) -> Rig:
     return rig.model_copy(update={"probe": rig.probe.model_copy(update=fields)})
 
 
-def fans(setup: Setup) -> list[Row]:
-    """Point 8: fans found in what changes, over tissue, of arrays of several radii."""
+def fans(setup: Setup) -> Figures:
+    """Fans found in what changes, over tissue, of arrays of several radii."""
     tissue = body(build_scene({"kind": "breast"}))
     off, agree = [], []
     for radius, sector, mhz in FANS:
@@ -101,11 +84,7 @@ def fans(setup: Setup) -> list[Row]:
         found = fan_region.find(images, "fans")
         off.append([abs(found.left_deg - truth.left_deg), abs(found.right_deg - truth.right_deg)])
         agree.append(_agreement(found, truth, (array.image_size[1], array.image_size[0])))
-    what = f"fans of {len(FANS)} curved arrays, found in {FAN_IMAGES} B-scans of tissue"
-    return [
-        Row("8", f"{what}: worst angle of a side", float(np.max(off)), 1.0, None, "deg"),
-        Row("8", f"{what}: least area in common, over that of either", float(np.min(agree)), 0.95, 1.0, "", at_least=True),
-    ]
+    return {"arrays": len(FANS), "images": FAN_IMAGES, "angle_deg": np.max(off), "common": np.min(agree)}
 
 
 def curved(like: Transducer, radius: float, sector: float, mhz: float) -> tuple[Transducer, Fan]:
@@ -124,22 +103,13 @@ def _agreement(found: Fan, truth: Fan, shape: tuple[int, int]) -> float:
     return float((one & other).sum() / (one | other).sum())
 
 
-def curved_lag(setup: Setup) -> list[Row]:
-    """Point 8: the lag of a curved array over a tank's bottom, its fan found."""
+def curved_lag(setup: Setup) -> Figures:
+    """The lag of a curved array over a tank's bottom, its fan found."""
     array, tank = setup.scanners["curved"], body(build_scene({"kind": "tank"}))
     planned = sweep_session.plan_sweep(Bob(), setup.rig, tank, array, Clocks(lag_s=LAG_S), PoseNoise(), SEED)
     images = [one.image for one in scans(tank, array, planned.truth.poses, SEED)]
     part = fan_region.find(images, "bottom").mask((array.image_size[1], array.image_size[0]))
-    depths = np.array(list(_depths(images, part)))
+    depths = np.array([latency.bottom_depth(image, part=part) for image in images])
     found = latency.estimate(planned.times, depths, planned.track)
-    what = f"curved array over a tank's bottom, {len(images)} B-scans, its fan found"
-    return [
-        Row("8", f"{what}: share that shows the bottom", float(np.isfinite(depths).mean()), 0.95, 1.0, "", at_least=True),
-        Row(
-            "8", f"{what}: error of the lag (limit: predicted)", 1e3 * abs(found.seconds - LAG_S), 2.0, 1e3 * found.sigma_s, "ms"
-        ),
-    ]
-
-
-def _depths(images: list[NDArray[np.uint8]], part: NDArray[np.bool_]) -> Iterator[float]:
-    return (latency.bottom_depth(image, part=part) for image in images)
+    error = {"error_ms": 1e3 * abs(found.seconds - LAG_S), "predicted_ms": 1e3 * found.sigma_s}
+    return error | {"images": len(images), "shown": np.isfinite(depths).mean()}

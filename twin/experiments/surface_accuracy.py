@@ -1,6 +1,5 @@
 """Accuracy of the surface: the paper's planes and sphere, the breast, unwrapping under stress, and a real relief."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -19,15 +18,13 @@ from scenes.scene_types import Scene
 from twin.conditions import IDEAL, Conditions
 from twin.evaluation import surface_errors
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.light_transport import Tracing
 from twin.optics.ray_world import visible
 from twin.optics.surface_session import Shooting, View, calibration_of, shoot
 
 TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
-PAPER_SPHERE_RADIUS_MM, PAPER_SPHERE_RMS_MM = 0.045, 0.040
 REAL_DEPTH_MM = (690.0, 780.0)
-GAMMAS = (1.4, 1.8, 2.2, 2.6)  # of light, between usual projectors and too steep ones
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
 
 
@@ -70,85 +67,41 @@ def experiment(
     return Experiment(view, truth, found, points, comparison, surface_errors.measure(points.points, comparison, truth))
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group, at full size; those of the real relief only where its recording is."""
-    return [
-        *(lambda pose=pose: planes(setup, pose) for pose in range(len(plane.PAPER_POSES))),
-        lambda: sphere(setup),
-        lambda: breast(setup),
-        lambda: orders_under_stress(setup),
-        lambda: bent_light(setup),
-        *([lambda: real_capture(setup)] if setup.real else []),
-    ]
-
-
-def planes(setup: Setup, pose: int) -> list[Row]:
-    """Row d: one plane of the paper's protocol; RMS about the fitted plane, and residuals over predicted sigma."""
+def planes(setup: Setup, number: int) -> Figures:
+    """One plane of the paper's protocol, from 1: RMS about the fitted plane, and residuals over predicted sigma."""
+    pose = number - 1
     metrics = experiment(setup.rig, plane.build(plane.PAPER_POSES[pose]), setup.sequences["paper_surface"], seed=pose).metrics
-    limit = metrics["limit_rms_mm"]
-    what = f"plane {pose + 1} of 5"
-    return [
-        Row(
-            "d",
-            f"{what}: RMS about the fitted plane (paper: 0.101 to 0.131)",
-            metrics["plane_plate_rms_mm"],
-            1.25 * limit,
-            limit,
-            "mm",
-        ),
-        Row("d", f"{what}: spread of error / predicted sigma, off from 1", abs(metrics["z_std"] - 1), 0.1, 0.0, ""),
-    ]
+    return {
+        "rms_mm": metrics["plane_plate_rms_mm"],
+        "limit_mm": metrics["limit_rms_mm"],
+        "z_spread_off": abs(metrics["z_std"] - 1),
+    }
 
 
-def sphere(setup: Setup) -> list[Row]:
-    """Row e: the paper's sphere."""
-    result = experiment(setup.rig, build_scene({"kind": "sphere"}), setup.sequences["paper_surface"], seed=10)
-    radius, rms = abs(result.metrics["sphere_sphere_radius_error_mm"]), result.metrics["sphere_sphere_rms_mm"]
-    limit = result.metrics["sphere_sphere_limit_rms_mm"]
-    return [
-        Row("e", f"sphere of 19.8 mm: radius error (paper: {PAPER_SPHERE_RADIUS_MM})", radius, 0.02, None, "mm"),
-        Row("e", f"sphere of 19.8 mm: RMS (paper: {PAPER_SPHERE_RMS_MM})", rms, 0.04, limit, "mm"),
-    ]
+def sphere(setup: Setup) -> Figures:
+    """The paper's sphere."""
+    found = experiment(setup.rig, build_scene({"kind": "sphere"}), setup.sequences["paper_surface"], seed=10).metrics
+    names = {"rms_mm": "rms_mm", "limit_mm": "limit_rms_mm", "radius_error_mm": "radius_error_mm"}
+    return {name: abs(found[f"sphere_sphere_{figure}"]) for name, figure in names.items()}
 
 
-def breast(setup: Setup) -> list[Row]:
-    """Row f: the breast phantom on its table."""
-    metrics = experiment(setup.rig, build_scene({"kind": "breast"}), setup.sequences["paper_surface"], seed=20).metrics
-    return [
-        Row("f", "breast: pixels seen by both devices that became points", metrics["coverage"], 0.97, 1.0, "", at_least=True),
-        Row("f", "breast: RMS", metrics["surface_rms_mm"], 0.06, metrics["limit_rms_mm"], "mm"),
-        Row("f", "breast: points off by more than 1 mm", metrics["gross_error_fraction"], 5e-4, 0.0, ""),
-        Row("f", "breast: points where nothing is lit", metrics["false_points"], 0, 0, "points"),
-    ]
+def breast(setup: Setup) -> Figures:
+    """The breast phantom on its table."""
+    return experiment(setup.rig, build_scene({"kind": "breast"}), setup.sequences["paper_surface"], seed=20).metrics
 
 
-def orders_under_stress(setup: Setup) -> list[Row]:
-    """Row g: two separated objects with deep steps and shadows, unwrapped in three ways."""
-    scene = build_scene({"kind": "two_objects"})
-    rows = []
-    for name in ("gray_surface", "multi_frequency", "paper_surface"):
-        result = experiment(setup.rig, scene, setup.sequences[name], seed=30)
-        rows.append(Row("g", f"two objects, {name}: points on a wrong fringe order", wrong_orders(result, 12), 0, 0, "points"))
-        if name == "paper_surface":
-            unreachable = int(np.count_nonzero(result.found.status == Status.UNREACHABLE))
-            rows.append(
-                Row(
-                    "g",
-                    "two objects, centre line: pixels reported as not reachable",
-                    unreachable,
-                    1000,
-                    None,
-                    "px",
-                    at_least=True,
-                )
-            )
-        else:
-            rows.append(Row("g", f"two objects, {name}: coverage", result.metrics["coverage"], 0.9, 1.0, "", at_least=True))
-    return rows
+def orders_under_stress(setup: Setup, sequence: str) -> Figures:
+    """Two separated objects with deep steps and shadows, unwrapped by a sequence."""
+    result = experiment(setup.rig, build_scene({"kind": "two_objects"}), setup.sequences[sequence], seed=30)
+    return {
+        "wrong_orders": wrong_orders(result, 12),
+        "unreachable": np.count_nonzero(result.found.status == Status.UNREACHABLE),
+        "coverage": result.metrics["coverage"],
+    }
 
 
-def bent_light(setup: Setup, gammas: Sequence[float] = GAMMAS) -> list[Row]:
-    """Row g: a plane by three steps under gammas that the pipeline isn't given, against the same under linear light."""
+def bent_light(setup: Setup, gamma: float) -> Figures:
+    """A plane by three steps under a gamma that the pipeline isn't given, against the same under linear light."""
     fringes = Fringes(pitch=18, steps=3)
     code = GrayCode(pitch=18, bits=7, complementary=True)
     patterns = Patterns(projector_size=setup.rig.projector.optics.size, unwrap="gray", parts=(fringes, code))
@@ -157,13 +110,8 @@ def bent_light(setup: Setup, gammas: Sequence[float] = GAMMAS) -> list[Row]:
         rig = setup.rig.model_copy(update={"projector": setup.rig.projector.model_copy(update={"gamma": gamma})})
         return experiment(rig, plane.build(plane.PAPER_POSES[2]), patterns, seed=40).metrics
 
-    linear, rows = shot(1.0), []
-    for gamma in gammas:
-        metrics = shot(gamma)
-        ratio, what = metrics["surface_rms_mm"] / linear["surface_rms_mm"], f"plane, three steps under a gamma of {gamma:g}"
-        rows.append(Row("g", f"{what}: RMS, as a share of that of linear light", ratio, 1.3, None, ""))
-        rows.append(Row("g", f"{what}: spread of error / predicted sigma, off from 1", abs(metrics["z_std"] - 1), 0.1, 0.0, ""))
-    return rows
+    linear, bent = shot(1.0), shot(gamma)
+    return {"rms_ratio": bent["surface_rms_mm"] / linear["surface_rms_mm"], "z_spread_off": abs(bent["z_std"] - 1)}
 
 
 def wrong_orders(result: Experiment, pitch: float) -> int:
@@ -180,18 +128,14 @@ def wrong_orders(result: Experiment, pitch: float) -> int:
     return int(np.count_nonzero(np.isfinite(result.points.points[..., 0]) & ~(nearest < pitch / 2)))
 
 
-def real_capture(setup: Setup) -> list[Row]:
-    """Row i: a plaster relief recorded by others (12 steps of 60 px, Gray code)."""
-    points, _ = relief(setup)
+def real_capture(setup: Setup) -> Figures:
+    """A plaster relief recorded by others (12 steps of 60 px, Gray code)."""
+    points, centre = relief(setup)
     depth = points.points[..., 2]
     known = depth[np.isfinite(depth)]
-    inside = float(np.mean((known > REAL_DEPTH_MM[0]) & (known < REAL_DEPTH_MM[1])))
-    ratio, what = relief_noise_ratio(setup), "real relief: local residual / predicted sigma on smooth patches, or its inverse"
-    return [
-        Row("i", "real relief: points", known.size, 210_000, None, "points", at_least=True),
-        Row("i", "real relief: share of points from 690 to 780 mm", inside, 0.999, 1.0, "", at_least=True),
-        Row("i", what, max(ratio, 1 / ratio), 1.4, 1.0, ""),
-    ]
+    inside = np.mean((known > REAL_DEPTH_MM[0]) & (known < REAL_DEPTH_MM[1]))
+    ratio = smooth_noise_ratio(np.linalg.norm(points.points - centre, axis=-1), points.sigma)
+    return {"points": known.size, "inside": inside, "noise_ratio": max(ratio, 1 / ratio)}
 
 
 def relief(setup: Setup) -> tuple[PointMap, NDArray[np.float64]]:
@@ -203,12 +147,6 @@ def relief(setup: Setup) -> tuple[PointMap, NDArray[np.float64]]:
     camera, projector = optics["cam1"], optics["projector"]
     found = decode(read_images(paths, camera.size, 8), patterns, name=folder.name)
     return clean(triangulate(found, camera, projector), camera, found.modulation), camera.centre
-
-
-def relief_noise_ratio(setup: Setup) -> float:
-    """Noise of the real relief's points over their predicted sigma."""
-    points, centre = relief(setup)
-    return smooth_noise_ratio(np.linalg.norm(points.points - centre, axis=-1), points.sigma)
 
 
 def smooth_noise_ratio(distance: NDArray[np.float32], sigma: NDArray[np.float32], smoothest: float = 0.25) -> float:

@@ -1,6 +1,6 @@
 """Accuracy with a target that isn't printed as designed: found, measured from a film, and tracked with what was measured."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 
@@ -12,11 +12,12 @@ from recon.geometry import rigid
 from recon.model import circle_layout
 from recon.model.rig import Target
 from recon.target_calibration import target_bundle, target_poses
+from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from twin.experiments import tracking_frames
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.pose_accuracy import LIT_DN, cameras_of, pose_errors
-from twin.experiments.table_rows import Row, Setup
 from twin.tracking.rendered_views import Frames
 from twin.tracking.samples import Take
 
@@ -40,48 +41,35 @@ class Tracked:
     squared: Array  # (n,) squared error over the whole covariance, chi-square with 6 degrees
 
 
-def rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Row e: designs that the target differs from, before and after it was measured, beside the target's own."""
+def designs(setup: Setup) -> Figures:
+    """Designs that the target differs from, before and after it was measured, beside the target's own."""
     shown, actual = list(tracking_frames.study(setup, SEED, COUNT, LIT_DN, 0.0, RAYS)), setup.rig.target
-    exact = tracked(shown, actual.model_copy(update={"tolerance_mm": 0.0}), networks)
+    found_by = nets.load()
+    exact = [tracked(shown, actual.model_copy(update={"tolerance_mm": 0.0}), found_by)]
     before, after, errors, squared = [], [], [], []
     for seed in PRINTS:
         design = misprinted(actual, seed)
-        before.append(tracked(shown, design, networks))
-        found = target_bundle.adjust(seen(shown, design, networks), design, None)
+        before.append(tracked(shown, design, found_by))
+        found = target_bundle.adjust(seen(shown, design, found_by), design, None)
         off = circle_layout.lengths(found.target) - circle_layout.lengths(actual)
         errors.append(off)
         squared.append(off @ np.linalg.solve(found.covariance[:3, :3], off))
-        after.append(tracked(shown, found.target, networks))
-    of = f"{len(PRINTS)} designs off by up to {ERROR_MM} mm, {COUNT} pairs each"
-    found = np.isfinite([one.shift_mm for one in before])
-    largest, lengths = np.abs(errors).max(axis=0), float(np.mean(squared))
-    return [
-        Row("e", f"{of}: found before measuring", 100 * found.mean(), 97.0, None, "%", at_least=True),
-        *_honest(f"{of}: before", before),
-        Row("e", f"{of}: translation before, median", _median(before, "shift_mm"), None, _median([exact], "shift_mm"), "mm"),
-        Row("e", f"{of}: rotation before, median", _median(before, "turn_deg"), None, _median([exact], "turn_deg"), "deg"),
-        *(
-            Row("e", f"{of}: error of {name.removesuffix('_mm')} as measured, largest", error, 0.01, None, "mm")
-            for name, error in zip(actual.LENGTHS, largest.tolist(), strict=True)
-        ),
-        Row("e", f"{of}: squared error of the lengths over covariance, chi-square of 3: mean", lengths, 8.0, 3.0, ""),
-        *_honest(f"{of}: after", after),
-        Row("e", f"{of}: translation after, median, over that with the true target",
-            _median(after, "shift_mm") / _median([exact], "shift_mm"), 1.1, 1.0, ""),
-        Row("e", f"{of}: rotation after, median, over that with the true target",
-            _median(after, "turn_deg") / _median([exact], "turn_deg"), 1.1, 1.0, ""),
-    ]  # fmt: skip
+        after.append(tracked(shown, found.target, found_by))
+    figures: Figures = {"designs": len(PRINTS), "found_percent": 100 * np.isfinite([one.shift_mm for one in before]).mean()}
+    figures |= dict(zip(actual.LENGTHS, np.abs(errors).max(axis=0).tolist(), strict=True)) | {"squared": np.mean(squared)}
+    for figure in ("shift_mm", "turn_deg"):
+        for name, results in (("exact", exact), ("before", before), ("after", after)):
+            figures[f"{figure}_{name}"] = np.nanmedian([getattr(one, figure) for one in results])
+        figures[f"{figure}_ratio"] = figures[f"{figure}_after"] / figures[f"{figure}_exact"]
+    return figures | _honest("before", before) | _honest("after", after)
 
 
-def false_rows(setup: Setup, networks: Networks) -> list[Row]:
-    """Row e: poses that are wrong, in frames as in a data set, dark, moving and covered, tracked with wrong designs."""
+def false_poses(setup: Setup) -> Figures:
+    """Poses that are wrong, in frames as in a data set, dark, moving and covered, tracked with wrong designs."""
     unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, SAMPLES) for seed in UNSEEN)
-    designs = [misprinted(setup.rig.target, seed) for seed in PRINTS[:DESIGNS]]
-    wrong = sum(_wrong(one, design, networks) for one in unseen for design in designs)
-    pairs = len(UNSEEN) * SAMPLES * len(designs)
-    what = f"poses off by more than {WRONG_MM:g} mm and {WRONG_SIGMAS:g} standard deviations, of {pairs} pairs"
-    return [Row("e", what, wrong, 0, 0, "")]
+    found_by, wrong = nets.load(), [misprinted(setup.rig.target, seed) for seed in PRINTS[:DESIGNS]]
+    false = sum(_wrong(one, design, found_by) for one in unseen for design in wrong)
+    return {"false": false, "pairs": len(UNSEEN) * SAMPLES * len(wrong)}
 
 
 def misprinted(actual: Target, seed: int) -> Target:
@@ -128,14 +116,8 @@ def _wrong(one: Shown, design: Target, networks: Networks) -> bool:
     return bool(not one[0].present or errors[0] > max(WRONG_MM, WRONG_SIGMAS * sigma))
 
 
-def _median(results: Sequence[Tracked], figure: str) -> float:
-    return float(np.nanmedian([getattr(one, figure) for one in results]))
-
-
-def _honest(what: str, results: Sequence[Tracked]) -> Iterator[Row]:
+def _honest(when: str, results: Sequence[Tracked]) -> Figures:
     """Whether poses' errors are as large as their covariance has it."""
     squared = np.concatenate([one.squared for one in results])
     squared = squared[np.isfinite(squared)]
-    inside = 100 * float(np.mean(squared < chi2.ppf(0.95, 6)))
-    yield Row("e", f"{what}: squared error over covariance, chi-square of 6: mean", float(squared.mean()), 7.5, 6.0, "")
-    yield Row("e", f"{what}: errors within the 95 % region", inside, 90.0, 95.0, "%", at_least=True)
+    return {f"squared_{when}": squared.mean(), f"inside_{when}": 100 * np.mean(squared < chi2.ppf(0.95, 6))}

@@ -1,9 +1,10 @@
 """Frames for measurements of tracking, rendered on demand: unseen ones like training data, and studies."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from recon.errors import InputError
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 from twin.shooting import Quality
 from twin.tracking.mesh_bank import build_bank
 from twin.tracking.rendered_views import Frames, render_full, render_sketches
@@ -16,6 +17,12 @@ BATCH = 4  # takes in one launch
 STUDY_VARIANTS = 12  # of bodies and surroundings
 MOST_TRIES = 50  # poses for each that shows the target whole
 WHOLLY = 0.999  # of each disc: what a study asks to be seen of them
+
+
+def exactly_printed(setup: Setup) -> Setup:
+    """The same, its target known as it is rendered, to the last digit."""
+    exact = setup.rig.target.model_copy(update={"tolerance_mm": 0.0})
+    return replace(setup, rig=setup.rig.model_copy(update={"target": exact}))
 
 
 def ranges_of(setup: Setup) -> DataRanges:

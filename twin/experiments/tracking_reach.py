@@ -14,11 +14,13 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import CameraDevice, Lens, Optics, Pose, Rig, Target
+from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from twin.experiments import tracking_frames
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.pose_accuracy import cameras_of, pose_errors
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.tracking_frames import exactly_printed
 from twin.shooting import FilmQuality
 from twin.tracking.mesh_bank import build_bank
 from twin.tracking.rendered_views import Frames, render_film
@@ -57,16 +59,11 @@ class Reached:
     wrong: bool
 
 
-def rows(setup: Setup, networks: Networks, count: int = COUNT, most_px: float = np.inf) -> list[Row]:
+def drawn_rigs(setup: Setup, count: int = COUNT, most_px: float = np.inf) -> Figures:
     """Shares found, and wrong ones; of rigs of `most_px` pixels at most."""
-    reached = list(tracked(setup, networks, SEED, count, most_px))
-    found = np.array([one.how is not None for one in reached])
-    wrong = sum(one.wrong for one in reached)
-    what = f"drawn rigs of 0.3 to 12 MP, circles of {LEAST_PX:g} px and more ({len(reached)} pairs)"
-    return [
-        Row("r", f"targets found from nothing, {what}", float(100 * found.mean()), 99.0, None, "%", at_least=True),
-        Row("r", f"wrong poses, {what}", float(wrong), 0.0, 0.0, ""),
-    ]
+    reached = list(tracked(exactly_printed(setup), nets.load(), SEED, count, most_px))
+    found, wrong = 100 * np.mean([one.how is not None for one in reached]), sum(one.wrong for one in reached)
+    return {"pairs": len(reached), "found_percent": found, "wrong": wrong}
 
 
 def tracked(setup: Setup, networks: Networks, seed: int, count: int, most_px: float = np.inf) -> Iterator[Reached]:

@@ -9,9 +9,9 @@ from recon.tracking import networks
 from twin.evaluation.surface_errors import rms
 from twin.experiments import closed_forms, tracking_frames
 from twin.experiments.experiment_runs import Experiment, Settings
+from twin.experiments.experiment_setup import Setup
 from twin.experiments.layout import laid_out
 from twin.experiments.pose_accuracy import cameras_of, located
-from twin.experiments.table_rows import Setup
 from twin.tracking.samples import Take
 
 

@@ -22,7 +22,7 @@ from recon.model.boards import Board, Discs
 from recon.model.circle_layout import circle_centres
 from recon.structured_light.decode import decode
 from recon.tracking import networks, photographs
-from twin.experiments.table_rows import Measurement, Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 
 DPI = 600  # of a printer
 MARGIN_MM = 5.0
@@ -34,7 +34,6 @@ BOARDS: dict[str, Board] = {
     "chessboard": Chessboard(columns=8, rows=5, square_mm=20),
     "ChArUco": Charuco(columns=8, rows=11, square_mm=20, marker_mm=15),
 }
-ROUNDING_PX = 0.034  # of the coarsest fringes, 64 px by three steps, in levels of eight bits
 REPLACED = 500  # times
 WRITER = f"""
 from pathlib import Path
@@ -45,52 +44,40 @@ for number in range({REPLACED}):
 """
 
 
-def measurements(setup: Setup) -> list[Measurement]:
-    """The rows of the group."""
-    return [
-        *(lambda name=name, board=board: printed_board(name, board) for name, board in BOARDS.items()),
-        lambda: printed_target(setup),
-        lambda: projected(setup),
-        replaced,
-    ]
+def printed_board(setup: Setup, board: str) -> Figures:
+    """A board on A4, at a printer's resolution, as our detectors find it."""
+    design = BOARDS[board]
+    image, pixel = raster(board_drawing.card_of(design))
+    found = detect(image, design)
+    figures = {"dpi": DPI, "points_mm": misfit(found.pixels * pixel, design.points())}
+    if found.radii is not None and isinstance(design, Discs):
+        figures["diameters_mm"] = np.abs(2 * found.radii * pixel.mean() - design.diameter_mm).max()
+    return figures
 
 
-def printed_board(name: str, board: Board) -> list[Row]:
-    """Point f: a board on A4, at a printer's resolution, as our detectors find it."""
-    image, pixel = raster(board_drawing.card_of(board))
-    found = detect(image, board)
-    rows = [Row("f", f"{name}, printed at {DPI} dpi: points off", misfit(found.pixels * pixel, board.points()), 0.02, None, "mm")]
-    if found.radii is not None and isinstance(board, Discs):
-        worst = float(np.abs(2 * found.radii * pixel.mean() - board.diameter_mm).max())
-        rows.append(Row("f", f"{name}, printed at {DPI} dpi: diameters off", worst, 0.02, None, "mm"))
-    return rows
-
-
-def printed_target(setup: Setup) -> list[Row]:
-    """Point f: the target on A4, as the tracker finds it."""
+def printed_target(setup: Setup) -> Figures:
+    """The target on A4, as the tracker finds it."""
     target = setup.rig.target
     image, pixel = raster(target_drawing.card_of(target))
     outlines = photographs.find(image, networks.load(), target).outlines
     off = misfit(outlines.ellipses.centre * pixel * [1, -1], circle_centres(target))
-    wide = float(np.abs(2 * outlines.ellipses.semi_axes * pixel.mean() - target.outer_diameter_mm).max())
-    what = f"target, printed at {DPI} dpi, found by the tracker's networks"
-    return [Row("f", f"{what}: centres off", off, 0.02, None, "mm"), Row("f", f"{what}: diameters off", wide, 0.02, None, "mm")]
+    wide = np.abs(2 * outlines.ellipses.semi_axes * pixel.mean() - target.outer_diameter_mm).max()
+    return {"dpi": DPI, "centres_mm": off, "diameters_mm": wide}
 
 
-def projected(setup: Setup) -> list[Row]:
-    """Images for the projector, as a perfect camera on its axis sees them, decoded."""
-    rows = []
+def projected(setup: Setup) -> Figures:
+    """Images for the projector, as a perfect camera on its axis sees them, decoded: off at most, px, by the sequence."""
+    worst: Figures = {}
     for name, patterns in setup.sequences.items():
         found = decode(np.uint16(100) + np.uint16(15) * projected_images.images(patterns), patterns, bits=12)
         height, width = found.status.shape
         pairs = ((found.columns, np.arange(width)), (found.rows, np.arange(height)[:, None]))
-        worst = max(float(np.nanmax(np.abs(values - true))) for values, true in pairs if values is not None)
-        rows.append(Row("15", f"{name}: images for the projector, decoded: off at most", worst, ROUNDING_PX, None, "px"))
-    return rows
+        worst[name] = max(np.nanmax(np.abs(values - true)) for values, true in pairs if values is not None)
+    return worst
 
 
-def replaced() -> list[Row]:
-    """Points 2, b: a folder that is replaced over and over, under the eyes of another process."""
+def replaced(setup: Setup) -> Figures:
+    """A folder that is replaced over and over, under the eyes of another process."""
     root = Path(__file__).resolve().parents[2]
     with TemporaryDirectory() as name:
         mark, looks, missing = Path(name, "out", "mark"), 0, 0
@@ -99,10 +86,7 @@ def replaced() -> list[Row]:
             there = mark.is_file()
             if looks or there:  # it is counted from the first one on
                 looks, missing = looks + 1, missing + (not there)
-    return [
-        Row("2", f"a folder replaced {REPLACED} times: looks of another process that found none", missing, 0, None, ""),
-        Row("2", f"a folder replaced {REPLACED} times: looks", looks, 1000, None, "", at_least=True),
-    ]
+    return {"times": REPLACED, "looks": looks, "missing": missing}
 
 
 def raster(card: Card) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

@@ -13,7 +13,7 @@ from recon.segmentation import tube_wall
 from recon.segmentation.tube_wall import Appearance, Ring, Tube
 from scenes.acoustics import TISSUES
 from scenes.kinds import inner_cylinder
-from twin.experiments.table_rows import Row, Setup
+from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound.bscan import scan, scans
 from twin.ultrasound.echo_solids import Body, Wire, body
 from twin.ultrasound.probe_path import SurfacePath, along_surface
@@ -30,8 +30,6 @@ SLICES = 94  # of the paper
 PACE_MM_S = 10.0
 LENGTH_MM = 46.5  # of the stroke: half a millimetre from slice to slice
 STANDOFF_MM = 17.0  # of the face from the wall
-PAPER_MM = 0.72  # error of its diameter
-SEEDS = (1, 2)  # of path, noise and clocks
 WIRE_MM, WIRE_DEPTH_MM = 0.02, 20.0  # a thread's radius, and its depth: that of the wall's flank
 
 
@@ -44,23 +42,20 @@ class Stroke:
     images: list[NDArray[np.uint8]]
 
 
-def rows(setup: Setup) -> list[Row]:
-    """Rows h: the diameter against the true one, beside the standard deviation that the fit predicts."""
-    probe = setup.rig.probe
-    sweeps = [row for seed in SEEDS for row in judged(stroke(probe, SLICES, seed), probe, f"sweep {seed}")]
-    return [*sweeps, wider(stroke(probe, SLICES // 2, SEEDS[0], WIDER), probe)]
+def one_sweep(setup: Setup, seed: int) -> Figures:
+    """A sweep of as many slices as the paper's."""
+    return judged(stroke(setup.rig.probe, SLICES, seed), setup.rig.probe)
 
 
-def wider(recorded: Stroke, probe: Probe) -> Row:
-    """Row h with a beam that isn't the default's, its spread as measured; what the default's spread would cost is in its text."""
-    looks = (Appearance(spread_mm=spread(WIDER)), Appearance())
+def wider_beam(setup: Setup, seed: int = 1, slices: int = SLICES // 2) -> Figures:
+    """A beam that isn't the default's, its spread as measured, and what the default's spread would cost."""
+    recorded, looks = stroke(setup.rig.probe, slices, seed, WIDER), (Appearance(spread_mm=spread(WIDER)), Appearance())
     speed = float(sound_in_water.speed_of_sound(TEMPERATURE_C))
-    tubes = [measured(recorded, probe, speed, look)[1] for look in looks]
+    tubes = [measured(recorded, setup.rig.probe, speed, look)[1] for look in looks]
     error, unknown = (abs(2 * one.shape.radius - recorded.scene.diameter_mm) for one in tubes)
     across, deep = looks[0].spread_mm
-    what = f"wider beam, spread as measured on a wire's echo, {across:.2f} and {deep:.2f} mm"
-    name = f"inner cylinder, {len(recorded.images)} slices, {what}: error of the diameter (by the default spread: {unknown:.2f})"
-    return Row("h", name, error, 0.15, 2 * tubes[0].sigma_mm, "mm")
+    own = {"error_mm": error, "limit_mm": 2 * tubes[0].sigma_mm, "default_mm": unknown}
+    return own | {"slices": len(recorded.images), "across_mm": across, "deep_mm": deep}
 
 
 def spread(transducer: Transducer) -> tuple[float, float]:
@@ -118,18 +113,15 @@ def measured(recorded: Stroke, probe: Probe, speed: float, look: Appearance | No
     return rings, tube_wall.fit_tube(rings, world_from_pixel)
 
 
-def judged(recorded: Stroke, probe: Probe, what: str) -> list[Row]:
-    """Rows of one sweep."""
+def judged(recorded: Stroke, probe: Probe) -> Figures:
+    """Errors of one sweep's tube."""
     rings, tube = measured(recorded, probe, float(sound_in_water.speed_of_sound(TEMPERATURE_C)))
-    name = f"inner cylinder, {len(rings)} slices, {what}"
-    error = abs(2 * tube.shape.radius - recorded.scene.diameter_mm)
-    turn = float(np.rad2deg(np.arccos(min(abs(tube.shape.axis[0]), 1.0))))
-    aside = float(np.linalg.norm((tube.shape.point - recorded.scene.centre_mm)[1:]))
-    found = float(np.mean([one.found for one in rings]))
-    return [
-        Row("h", f"{name}: error of the diameter (paper: {PAPER_MM})", error, 0.15, 2 * tube.sigma_mm, "mm"),
-        Row("h", f"{name}: share with a ring", found, 0.95, None, "", at_least=True),
-        Row("h", f"{name}: error of the axis' direction", turn, 0.1, None, "deg"),
-        Row("h", f"{name}: distance of the axis, in the middle", aside, 0.1, None, "mm"),
-        Row("h", f"{name}: RMS of the points about the tube", tube.rms, 0.1, None, "mm"),
-    ]
+    return {
+        "slices": len(rings),
+        "error_mm": abs(2 * tube.shape.radius - recorded.scene.diameter_mm),
+        "limit_mm": 2 * tube.sigma_mm,
+        "found": np.mean([one.found for one in rings]),
+        "turn_deg": np.rad2deg(np.arccos(min(abs(tube.shape.axis[0]), 1.0))),
+        "aside_mm": np.linalg.norm((tube.shape.point - recorded.scene.centre_mm)[1:]),
+        "rms_mm": tube.rms,
+    }

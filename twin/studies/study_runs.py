@@ -6,10 +6,8 @@ that they depend on, and `OUT/table.parquet` has a row a trial.
 
 import json
 import math
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from recon.errors import InputError
-from recon.files import atomic, json_text
+from recon.files import atomic
 from recon.files.metrics import Metrics
-from twin.engine import Engine, results
+from twin.engine import Engine
 from twin.experiments import experiment_runs
 from twin.experiments.experiment_runs import Settings
+from twin.experiments.kept_figures import Kept
 from twin.studies.factors import Point
 
 STUDY, TABLE, TRIALS = "study.json", "table.parquet", "trials"
@@ -72,45 +70,28 @@ class StudyFolder:
         """Where trials are kept."""
         return self.shared or self.folder / TRIALS
 
+    @property
+    def figures(self) -> Kept:
+        """Their figures."""
+        return Kept(self.trials)
+
     def open(self, description: Mapping[str, Any]) -> None:
         """Begin or go on with a study; raises InputError if the folder holds something else."""
         atomic.check_filled_folder(self.folder, BY)
         atomic.begin_filled(self.folder, BY)
-        self.trials.mkdir(parents=True, exist_ok=True)
-        for leftover in self.trials.glob(".*.new.json"):  # of a run that was killed while it wrote a trial
-            atomic.remove_leftovers(self._path(leftover.name.split(".")[1]))
+        self.figures.open()
         with atomic.listed_file(self.folder, STUDY, BY) as path:
             path.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
     def kept(self, trial: Trial) -> Done | None:
         """A trial that was done before, if it is whole."""
-        path = self._path(trial.key)
-        try:
-            content = json_text.read(path)
-            figures = content["figures"].items()
-            return Done(trial, {name: math.nan if value is None else float(value) for name, value in figures})
-        except (InputError, ValueError, KeyError, AttributeError, TypeError):  # none, or damaged: done again
-            return None
-
-    def keep(self, done: Done) -> None:
-        """Keep a trial's figures; one that gave none is tried again by a later run. A damaged one is set aside."""
-        if isinstance(done.found, str) or self.kept(done.trial) is not None:  # by another run, meanwhile
-            return
-        path = self._path(done.trial.key)
-        if os.path.lexists(path):  # it wasn't kept, and so was changed by somebody
-            aside = next(each for k in count(1) if not os.path.lexists(each := path.with_name(f"{path.name}.damaged{k}")))
-            path.rename(aside)
-        figures = {name: value if math.isfinite(value) else None for name, value in done.found.items()}
-        with atomic.new_file(self._path(done.trial.key)) as path:
-            path.write_text(json.dumps({"figures": figures}) + "\n", encoding="utf-8")
+        found = self.figures.read(trial.key)
+        return None if found is None else Done(trial, found)
 
     def write_table(self, done: Sequence[Done]) -> None:
         """Write a row a trial: its factors, its seed, its figures, and the error of one that has none."""
         with atomic.listed_file(self.folder, TABLE, BY) as path:
             pq.write_table(pa.Table.from_pylist(rows(done)), path)
-
-    def _path(self, key: str) -> Path:
-        return self.trials / f"{key}.json"
 
 
 def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[int]) -> list[Trial]:
@@ -122,18 +103,12 @@ def plan(name: str, points: Sequence[tuple[Point, Settings]], seeds: Sequence[in
 
 def run(folder: StudyFolder, name: str, trials: Sequence[Trial], engine: Engine) -> Iterator[Done]:
     """Do the trials that aren't kept, and give all of them as they are done."""
-    missing: dict[str, list[Trial]] = {}
+    alike: dict[str, list[Trial]] = {}  # where a factor changes nothing
     for trial in trials:
-        if (done := folder.kept(trial)) is not None:
-            yield done
-        else:
-            missing.setdefault(trial.key, []).append(trial)  # alike where a factor changes nothing
-    tasks = ((key, name, alike[0].settings, alike[0].seed) for key, alike in missing.items())
-    for key, found in results(engine, experiment_runs.run_trial, tasks):
-        for k, trial in enumerate(missing[key]):
-            if k == 0:
-                folder.keep(Done(trial, found))
-            yield Done(trial, found)
+        alike.setdefault(trial.key, []).append(trial)
+    tasks = {key: (name, some[0].settings, some[0].seed) for key, some in alike.items()}
+    for key, found in folder.figures.run(engine, experiment_runs.run_trial, tasks):
+        yield from (Done(trial, found) for trial in alike[key])
 
 
 def in_order(trials: Sequence[Trial], done: Sequence[Done]) -> list[Done]:

@@ -14,12 +14,13 @@ from recon.model.calibration import Calibration
 from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
 from scenes.kinds import board, plane
+from tests.twin.experiments.asked import missed, rows
 from twin import board_session
 from twin.experiments import calibration_accuracy
 from twin.experiments.baselines import opencv_peer
 from twin.experiments.board_sets import drawn, recalibrated
 from twin.experiments.calibration_errors import focal_error, motion_error, point_errors, scale_error, squared_length
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import calibration_of
 
@@ -35,9 +36,9 @@ def setup(rig) -> Setup:
     )
 
 
-def check(rows) -> None:
+def check(function, figures) -> None:
     """Every bar is met."""
-    assert not [row for row in rows if not row.ok]
+    assert not missed(function, figures)
 
 
 def test_poses_are_those_of_the_paper():
@@ -53,16 +54,16 @@ def test_corrected_centres_of_a_rendered_board(rig, monkeypatch):
     """
     monkeypatch.setattr(calibration_accuracy, "TRACING", calibration_accuracy.TRACING.model_copy(update={"samples": 4}))
     monkeypatch.setattr(board_session, "SIDE_SAMPLES", 4)
-    row = calibration_accuracy.centre_bias(rig, 9.0, 40.0)
-    check([row])
-    assert row.limit == pytest.approx(0.077, abs=0.005)
+    found = calibration_accuracy.centre_bias(Setup(rig), 9.0, 40.0)
+    check(calibration_accuracy.centre_bias, found)
+    assert found["uncorrected_px"] == pytest.approx(0.077, abs=0.005)
 
 
 def test_baselines_need_the_correction(rig):
     """Large discs on tilted boards: left out, the correction costs a hundredth of a millimetre of baseline."""
-    row = calibration_accuracy.baseline_bias(rig, 12.0, 40.0, count=6)
-    check([row])
-    assert row.limit > 0.005
+    found = calibration_accuracy.baseline_bias(Setup(rig), 12.0, 40.0, count=6)
+    check(calibration_accuracy.baseline_bias, found)
+    assert found["uncorrected_mm"] > 0.005
 
 
 def test_covariance_is_honest_and_no_worse_than_opencv(rig):
@@ -71,8 +72,10 @@ def test_covariance_is_honest_and_no_worse_than_opencv(rig):
     With so few calibrations shares of points in their regions and single parameters say little: they are left to the full rows.
     """
     drawings = recalibrated(rig, NOISE, draws=3, count=8)
-    check(calibration_accuracy.honesty(drawings)[:2])
-    check([row for row in opencv_peer.in_many_draws(drawings) if "projector: points" in row.what])
+    honest = rows(calibration_accuracy.honesty, calibration_accuracy.over_predictions(drawings))[:2]
+    assert all(row.met for row in honest)
+    peer = missed(calibration_accuracy.beside_opencv, opencv_peer.in_many_draws(drawings))
+    assert not [row for row in peer if "projector: points" in row.what]
 
 
 def test_a_covariance_too_small_is_found_out(rig):
@@ -80,9 +83,9 @@ def test_a_covariance_too_small_is_found_out(rig):
     seen, result = recalibrated(rig, NOISE, draws=3, count=8)[0]
     found = result.adjustment.calibration
     boast = replace(found, uncertainty=replace(found.uncertainty, covariance=found.uncertainty.covariance / 4))
-    assert not calibration_accuracy.honesty([(seen, replace(result, adjustment=replace(result.adjustment, calibration=boast)))])[
-        1
-    ].ok
+    boasted = replace(result, adjustment=replace(result.adjustment, calibration=boast))
+    figures = calibration_accuracy.over_predictions([(seen, boasted)])
+    assert rows(calibration_accuracy.honesty, figures)[1].met is False
 
 
 def test_figures_of_a_known_error(rig):
@@ -118,7 +121,7 @@ def test_bent_board(rig, rng):
     poses = random_poses(Poses(count=16), design, list(truth.cameras.values()))
     flat = drawn(truth, design, poses, dict(NOISE), rng)
     bent = drawn(truth, design, poses, dict(NOISE), rng, board.printed_centres(calibration_accuracy.BENT))
-    check(calibration_accuracy.board_shape(flat, bent))
+    check(calibration_accuracy.bad_board, calibration_accuracy.board_shape(flat, bent))
 
 
 @pytest.mark.slow
@@ -129,6 +132,5 @@ def test_rendered_calibration(setup, monkeypatch):
     """
     monkeypatch.setattr(calibration_accuracy, "TRACING", Tracing(samples=4, room_lux=20))
     monkeypatch.setattr(plane, "PAPER_POSES", plane.PAPER_POSES[::4])
-    seen, result = calibration_accuracy.calibrated(calibration_accuracy.session(setup, poses=Poses(count=10)))
-    check(calibration_accuracy.against_truth(seen, result))
-    check(calibration_accuracy.surfaces(setup, result.adjustment.calibration))
+    for function in (calibration_accuracy.against_truth, calibration_accuracy.surfaces):
+        check(function, function(setup, poses=10))

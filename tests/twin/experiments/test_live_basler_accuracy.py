@@ -2,13 +2,13 @@
 
 import pytest
 
-from twin.experiments import live_basler_accuracy
-from twin.experiments.table_rows import Setup, measure
+from tests.twin.experiments.asked import missed
+from twin.experiments import live_basler_accuracy as clocks
 
 
 @pytest.mark.slow
-def test_clocks_are_followed(rig, monkeypatch):
+def test_clocks_are_followed():
     """With the bars of all; one map of 60 may have an error of more than three standard deviations, normal ones do in 0.3 %."""
-    for name, count in (("DRAWS", 60), ("STEPS", 60), ("LOAD_FRAMES", 30_000)):
-        monkeypatch.setattr(live_basler_accuracy, name, count)
-    assert not [row for row in measure(live_basler_accuracy.measurements(Setup(rig, {}))) if not row.ok]
+    for delays in clocks.DELAYS:
+        assert not missed(clocks.maps, clocks.maps(None, delays, draws=60), delays=delays)
+    assert not missed(clocks.jumps, clocks.jumps(None, clocks=60)) and not missed(clocks.load, clocks.load(None, frames=30_000))

@@ -5,7 +5,7 @@ import pytest
 
 from scenes.catalogue import build_scene
 from twin.experiments import live_skin_accuracy as light
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 
 pytestmark = pytest.mark.slow
 

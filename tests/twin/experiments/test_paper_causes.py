@@ -8,8 +8,8 @@ from recon.capture.surface_part import read_patterns
 from scenes.kinds import plane
 from twin.conditions import Conditions, Frames
 from twin.experiments import paper_causes
+from twin.experiments.experiment_setup import Setup
 from twin.experiments.paper_causes import Cause
-from twin.experiments.table_rows import Setup
 
 PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_surface.yaml"
 

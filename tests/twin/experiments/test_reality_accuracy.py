@@ -6,8 +6,9 @@ import pytest
 
 from recon.capture.surface_part import read_patterns
 from scenes.kinds import plane
+from tests.twin.experiments.asked import missed
 from twin.experiments import reality_accuracy
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 
 PATTERNS = Path(__file__).resolve().parents[3] / "conf" / "patterns" / "paper_surface.yaml"
 
@@ -17,15 +18,14 @@ def test_a_disturbed_plane_is_as_good_as_a_steady_one(rig, monkeypatch):
     """Three planes twice, with the bars of all; without corrections their errors are 1.3 and 2.1 times as large."""
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 104))
     setup = Setup(rig, {"paper_surface": read_patterns(PATTERNS)})
-    rows = reality_accuracy.compared(setup, "planes", [plane.build(pose) for pose in plane.PAPER_POSES[:3]], "plane_plate_rms_mm")
-    assert len(rows) == 5
-    assert all(row.ok for row in rows), rows
+    monkeypatch.setattr(plane, "PAPER_POSES", plane.PAPER_POSES[:3])
+    assert not missed(reality_accuracy.compared, reality_accuracy.compared(setup, "planes"))
 
 
 @pytest.mark.slow
 def test_skin_costs_modulation_and_nothing_else(rig, monkeypatch):
     """One of the ten breasts with light that spreads and with gel, with the bars of all; without, noise leaves 0.024 mm."""
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 103))
-    rows = reality_accuracy.skins(Setup(rig, {"paper_surface": read_patterns(PATTERNS)}))
-    assert all(row.ok for row in rows), rows
-    assert 0.027 < rows[0].measured < 0.035
+    found = reality_accuracy.skins(Setup(rig, {"paper_surface": read_patterns(PATTERNS)}), spread_mm=0.4, wet=0.1)
+    assert not missed(reality_accuracy.skins, found, spread_mm=0.4, wet=0.1)
+    assert 0.027 < found["breast_mm"] < 0.035

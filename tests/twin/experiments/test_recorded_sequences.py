@@ -3,21 +3,22 @@
 import numpy as np
 
 from recon.freehand import sequences
+from tests.twin.experiments.asked import missed
 from twin.experiments import recorded_sequences
-from twin.experiments.table_rows import Setup
+from twin.experiments.experiment_setup import Setup
 
 
-def check(rows) -> None:
+def check(function, setup=None) -> None:
     """Every bar is met."""
-    assert not [row for row in rows if not row.ok]
+    assert not missed(function, function(setup))
 
 
 def test_sequences_are_the_same_after_writing_and_reading():
-    check(recorded_sequences.round_trip())
+    check(recorded_sequences.round_trip)
 
 
 def test_damaged_sequences_are_refused():
-    check(recorded_sequences.damaged())
+    check(recorded_sequences.damaged)
 
 
 def test_a_changed_pose_is_not_the_same(monkeypatch):
@@ -30,9 +31,9 @@ def test_a_changed_pose_is_not_the_same(monkeypatch):
         return frames
 
     monkeypatch.setattr(sequences, "read_sequence", nearly)
-    assert not recorded_sequences.round_trip()[0].ok
+    assert missed(recorded_sequences.round_trip, recorded_sequences.round_trip(None))
 
 
 def test_the_real_sweep(real, rig):
-    check(recorded_sequences.real_sweep(Setup(rig, {}, real)))
-    check(recorded_sequences.real_file(Setup(rig, {}, real)))
+    check(recorded_sequences.real_sweep, Setup(rig, real=real))
+    check(recorded_sequences.real_file, Setup(rig, real=real))

@@ -9,12 +9,12 @@ import pytest
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
 from recon.geometry.rigid import difference
-from recon.tracking import networks, views
+from recon.tracking import views
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.experiments import rivals, tracking_reach
 from twin.experiments.detection_rates import percent, score
+from twin.experiments.experiment_setup import Setup
 from twin.experiments.pose_accuracy import centre_limit, pose_errors
-from twin.experiments.table_rows import Setup
 from twin.tracking.target_truth import view_truth
 
 RIG = rig()
@@ -85,10 +85,9 @@ def test_rivals_are_summed_up_over_the_grid_and_drawn(tmp_path):
     shift[2:, :, :2] = 0.1
     shift[2:, 3:] *= 2
     tried = rivals.Tried("half", shift, 3 * shift)
-    rows = {row.what: row.measured for row in rivals.summary(tried)}
-    assert list(rows.values()) == pytest.approx([100 * 3 / 10, 0, 100 * 3 / 10, 0.1, 0.3])
+    assert list(rivals.summary(tried).values()) == pytest.approx([100 * 3 / 10, 0, 100 * 3 / 10, 0.1, 0.3])
     nothing = rivals.Tried("nothing", np.full_like(shift, np.nan), np.full_like(shift, np.nan))
-    assert [row.measured for row in rivals.summary(nothing)] == [0, 0, 0]
+    assert list(rivals.summary(nothing).values()) == [0, 0, 0]
     rivals.draw([tried, nothing], tmp_path / "rivals.png")
     assert cv2.imread(str(tmp_path / "rivals.png")).shape[1] > 600
 
@@ -97,5 +96,4 @@ def test_rivals_are_summed_up_over_the_grid_and_drawn(tmp_path):
 def test_drawn_rigs_of_any_resolution_are_tracked():
     """Five of the experiment's rigs, of up to 2.3 MP: all are found, and none wrongly; of 60 of all sizes all were."""
     setup = Setup(RIG, {}, frames=ranges(variants=2))
-    rows = tracking_reach.rows(setup, networks.load(threads=1), count=5, most_px=2_400_000)
-    assert [row.measured for row in rows] == [100.0, 0.0]
+    assert tracking_reach.drawn_rigs(setup, 5, 2_400_000) == {"pairs": 5, "found_percent": 100.0, "wrong": 0}

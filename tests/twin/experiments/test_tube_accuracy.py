@@ -8,7 +8,9 @@ import yaml
 
 from recon.probe_calibration import sound_in_water
 from recon.segmentation.echo_power import SPREAD_MM
+from tests.twin.experiments.asked import rows
 from twin.experiments import tube_accuracy
+from twin.experiments.experiment_setup import Setup
 from twin.ultrasound.transducer import Transducer
 
 SLICES = 7
@@ -23,13 +25,11 @@ def test_diameter_of_the_inner_cylinder(rig, recorded):
     """Within 0.15 mm, and within a bias of 0.05 mm and 2.5 of its own sigma, which poses wrong by some 0.1 mm a slice make a few
     hundredths of a mm. Eight draws were 0.01 to 0.11 mm too thin; the bias isn't in sigma.
     """
-    rows = tube_accuracy.judged(recorded, rig.probe, "few")
-    assert len(recorded.images) == SLICES
-    diameter, found = rows[0], rows[1]
-    assert found.measured == 1
-    assert diameter.ok and diameter.limit is not None
-    assert 0.005 < diameter.limit < 0.15
-    assert diameter.measured < 0.05 + 2.5 * diameter.limit
+    found = tube_accuracy.judged(recorded, rig.probe)
+    assert found["slices"] == SLICES and found["found"] == 1
+    assert rows(tube_accuracy.one_sweep, found)[0].met
+    assert 0.005 < found["limit_mm"] < 0.15
+    assert found["error_mm"] < 0.05 + 2.5 * found["limit_mm"]
 
 
 def test_depths_at_the_speed_that_the_scanner_assumes_are_wrong(rig, recorded):
@@ -60,8 +60,8 @@ def test_the_spread_of_a_wires_echo_grows_with_the_f_numbers():
 
 
 def test_a_wider_beam_is_stood_with_its_spread(rig):
-    row = tube_accuracy.wider(tube_accuracy.stroke(rig.probe, SLICES, 1, tube_accuracy.WIDER), rig.probe)
-    assert row.ok and "0.29 and 0.06 mm" in row.what
+    (row,) = rows(tube_accuracy.wider_beam, tube_accuracy.wider_beam(Setup(rig), slices=SLICES))
+    assert row.met and "0.29 and 0.06 mm" in row.what
 
 
 def test_the_default_spread_is_that_of_the_default_array():

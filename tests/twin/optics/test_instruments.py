@@ -6,7 +6,7 @@ import pytest
 
 from recon.geometry.camera import Camera
 from recon.model.rig import Lens
-from twin.experiments.optics_accuracy import STRONG_14
+from twin.experiments.optics_accuracy import LENSES
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays, transmission
 
 
@@ -14,7 +14,7 @@ from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, 
 def strong(rig) -> Camera:
     """The rig's projector with strong distortion of all kinds."""
     ideal = rig.projector.optics.camera()
-    return Camera(ideal.size, ideal.matrix, np.array(STRONG_14), ideal.camera_from_world)
+    return Camera(ideal.size, ideal.matrix, np.array(LENSES["strong"]), ideal.camera_from_world)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_projector_lights_nothing_behind_it(rig):
 def test_camera_rays_are_recons(rig, rng):
     """Through the lens's centre, rays at any offset within a pixel are recon's, as far as float32 carries."""
     camera = rig.cam2.optics.camera()
-    strong = Camera(camera.size, camera.matrix, np.array(STRONG_14), camera.camera_from_world)
+    strong = Camera(camera.size, camera.matrix, np.array(LENSES["strong"]), camera.camera_from_world)
     optics = CameraOptics(strong, 2.0, 660.0, 0.0, np.ones(camera.size[::-1], np.float32))
     offset = rng.uniform(-0.5, 0.5, 2)
     ray = sample_rays(optics, optics.tables, mi.Point2f(offset.tolist()), mi.Point2f(0, 0))

@@ -13,6 +13,7 @@ from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Scene, Thing
 from tests.twin.small_rigs import cropped
 from twin.experiments import optics_accuracy
+from twin.experiments.experiment_setup import Setup
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import LUMENS_PER_WATT, Tracing, render
 from twin.optics.mitsuba_reference import ideal_rig, mitsuba_scene, render_shown, show_pattern
@@ -113,7 +114,7 @@ def test_patterns_match_mitsuba(renders):
     """Pinholes and direct light: the difference to Mitsuba's path integrator is its Monte Carlo error and no more."""
     z = optics_accuracy.z_scores(*renders)
     # Student's t with 7 degrees of freedom (Mitsuba's samples have nearly all of the variance) has a spread of 1.18
-    assert z.std() < optics_accuracy.EDGES * np.sqrt(7 / 5)
+    assert z.std() < 1.1 * np.sqrt(7 / 5)
     assert abs(z.mean()) < 0.1
     assert (np.abs(z) > 8).mean() < 2e-3
 
@@ -148,8 +149,7 @@ def test_phase_error_of_the_renderer(rig):
     In a quarter of the image, from near a corner to the middle.
     """
     part = rig.model_copy(update={"cam1": cropped(rig.cam1, (640, 512), (100, 80))})
-    row = optics_accuracy.phase_error(part, samples=16)
-    assert row.ok, row
+    assert optics_accuracy.phase_error(Setup(part), samples=16)["phase_rms_px"] < 0.005
 
 
 def test_seed_decides(rig):

@@ -13,48 +13,40 @@ from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import Observations
 from twin.experiments.board_sets import BoardSet
 from twin.experiments.calibration_errors import DEPTHS, focal_error, motion_error, point_errors, rms_length
-from twin.experiments.table_rows import Row
+from twin.experiments.experiment_setup import Figures
 
-FIGURES = (
-    ("translation error", "mm"),
-    ("rotation error", "deg"),
-    ("focal lengths, the larger error", "%"),
-    ("points, RMS error", "mm"),
-)
-BESIDE = "(bar: OpenCV, corrected centres; limit: OpenCV)"
+FIGURES = ("shift_mm", "turn_deg", "focal_percent", "points_mm")
 SECOND = ("cam2", "projector")
+BY = ("ours", "corrected", "opencv")  # OpenCV with our corrections of the centres, and without
 
 
-def in_one_render(seen: BoardSet, result: Result) -> list[Row]:
-    """Row g: one rendered set. Chance has its part in a single set; a bar is set for the points only."""
+def in_one_render(seen: BoardSet, result: Result) -> Figures:
+    """One rendered set's points. Chance has its part in a single set."""
     volume = uncertainty.working_volume(seen.truth, DEPTHS)
-    rows = []
+    found: Figures = {"poses": len(seen.sightings)}
     for name in SECOND:
-        ours, corrected, raw = compare(seen.truth, result, name, volume)[:, -1]
-        what = f"{len(seen.sightings)} rendered poses, cam1 and {name}: points, RMS error {BESIDE}"
-        rows.append(Row("g", what, ours, corrected, raw, "mm"))
-    return rows
+        of = compare(seen.truth, result, name, volume)[:, -1]
+        found |= {f"{name}_points_mm_{by}": value for by, value in zip(BY, of, strict=True)}
+    return found
 
 
-def in_many_draws(drawings: Sequence[tuple[BoardSet, Result]]) -> list[Row]:
-    """Row g: RMS over calibrations of random poses and noise. The bar is OpenCV's error, given our corrections of the centres.
+def in_many_draws(drawings: Sequence[tuple[BoardSet, Result]]) -> Figures:
+    """RMS over calibrations of random poses and noise, also OpenCV's, with our corrections of the centres and without.
 
-    For camera 2, which OpenCV calibrates from the same numbers, a draw as good as it may come out on either side: its bar has
-    one standard error of the difference on top.
+    For camera 2, which OpenCV calibrates from the same numbers, a draw as good may come out on either side: with corrections
+    its figure has one standard error of the difference on top.
     """
     truth = drawings[0][0].truth
     volume = uncertainty.working_volume(truth, DEPTHS)
-    rows = []
+    found: Figures = {"draws": len(drawings)}
     for name in SECOND:
         squares = np.square([compare(truth, result, name, volume) for _, result in drawings])  # (draws, 3, figures)
         levels = squares.mean(axis=0)  # (3, figures)
         if name == "cam2":
             levels[1] += (squares[:, 0] - squares[:, 1]).std(axis=0, ddof=1) / np.sqrt(len(drawings))
-        for k, (figure, unit) in enumerate(FIGURES):
-            what = f"{len(drawings)} draws, cam1 and {name}: {figure} {BESIDE}"
-            ours, corrected, raw = np.sqrt(levels[:, k])
-            rows.append(Row("g", what, ours, corrected, raw, unit))
-    return rows
+        for of, values in zip(FIGURES, np.sqrt(levels).T, strict=True):
+            found |= {f"{name}_{of}_{by}": value for by, value in zip(BY, values, strict=True)}
+    return found
 
 
 def compare(truth: Calibration, result: Result, name: str, volume: Array) -> Array:

@@ -1,28 +1,33 @@
-"""All measured rows as one CSV file beside a document, and the document's short table of some of them.
+"""Rows of results: one figure beside its bar and its limit; their files, and a document's short table of some of them.
 
-CSV rather than Parquet, as a commit then shows which figures changed, and a forge shows and filters the file.
+Beside a document all rows stand in a CSV file, as a commit then shows which figures changed, and a forge shows and filters it;
+in a folder of results they stand in one tidy Parquet file, with experiment and settings.
 """
 
 import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from fnmatch import fnmatchcase
 from pathlib import Path
 from re import search
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from recon.errors import InputError
 from recon.files import atomic, yaml_text
-from twin.experiments import table_rows
-from twin.experiments.table_rows import Row
+from twin.experiments import document_tables
 
 MARK = "rows"  # of the short table's place in a document
+TABLE = "results.parquet"
+COLUMNS = 11  # of the CSV file: a row's first fields
 
 
 @dataclass(frozen=True)
-class Kept:
-    """A row with its group and the state of the code that gave it; the file's columns are these fields."""
+class Row:
+    """One figure for people, with the state of the code that gave it."""
 
     group: str
     id: str
@@ -30,11 +35,14 @@ class Kept:
     measured: float
     sense: str  # <= or >=; empty without a bar
     bar: float | None
-    limit: float | None
+    limit: float | None  # what physics allows, or the peer's figure
     unit: str
     met: bool | None  # by all digits; none without a bar
-    day: str  # UTC
-    commit: str  # two where later steps of a measurement were repeated
+    day: str = ""  # UTC
+    commit: str = ""  # two where later steps of a measurement were repeated
+    experiment: str = ""
+    settings: str = ""  # of the experiment, as JSON
+    figure: str = ""
 
     @property
     def strain(self) -> float:
@@ -46,22 +54,19 @@ class Kept:
             return math.inf
         return above / below if below > 0 else (math.inf if above > below else 0.0)
 
+    @property
+    def asked(self) -> str:
+        """The bar with its sense, in a cell."""
+        return "" if self.bar is None else f"{self.sense} {self.bar:.4g}"
+
 
 @dataclass(frozen=True)
 class Chosen:
-    """A row of the short table: kept rows in words, of which the worst is shown."""
+    """A row of the short table: rows in words, of which the worst is shown."""
 
     quantity: str
     conditions: str
     rows: tuple[str, ...]  # patterns of `GROUP ID WHAT`, with * and ?
-
-
-def kept(group: str, row: Row, day: str, commit: str) -> Kept:
-    """Give a measured row its group, day and commit."""
-    asked = row.bar is not None
-    sense = "" if not asked else ">=" if row.at_least else "<="
-    met = row.ok if asked else None
-    return Kept(group, row.id, row.what, row.measured, sense, row.bar, row.limit, row.unit, met, day, commit)
 
 
 def file_of(document: Path) -> Path:
@@ -69,8 +74,8 @@ def file_of(document: Path) -> Path:
     return document.with_suffix(".csv")
 
 
-def read(path: Path) -> list[Kept]:
-    """Read all rows; none if there is no file yet.
+def read(path: Path) -> list[Row]:
+    """Read all rows of a CSV file; none if there is no file yet.
 
     Raises
     ------
@@ -83,7 +88,7 @@ def read(path: Path) -> list[Kept]:
         table = list(csv.reader(path.read_text(encoding="utf-8").splitlines(), strict=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected rows as CSV, found {error}") from error
-    names = [field.name for field in fields(Kept)]
+    names = [field.name for field in fields(Row)][:COLUMNS]
     if not table or table[0] != names:
         raise InputError(f"{path}: line 1: expected {','.join(names)}, found {','.join(table[0]) if table else 'nothing'}")
     found = []
@@ -97,18 +102,19 @@ def read(path: Path) -> list[Kept]:
 
 def _row_of(
     group: str, id: str, what: str, measured: str, sense: str, bar: str, limit: str, unit: str, met: str, day: str, commit: str
-) -> Kept:
+) -> Row:
     asked, beside = (float(text) if text else None for text in (bar, limit))
     verdict = {"": None, "yes": True, "no": False}[met]
-    return Kept(group, id, what, float(measured), sense, asked, beside, unit, verdict, day, commit)
+    return Row(group, id, what, float(measured), sense, asked, beside, unit, verdict, day, commit)
 
 
-def write(path: Path, rows: Sequence[Kept]) -> None:
-    """Write all rows, figures by four digits as in the tables."""
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write all rows as CSV, figures by four digits as in the tables."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow([field.name for field in fields(Kept)])
-    table.writerows([_cell(getattr(row, field.name)) for field in fields(Kept)] for row in rows)
+    names = [field.name for field in fields(Row)][:COLUMNS]
+    table.writerow(names)
+    table.writerows([_cell(getattr(row, name)) for name in names] for row in rows)
     with atomic.new_file(path) as temporary:
         temporary.write_text(text.getvalue(), encoding="utf-8")
 
@@ -119,25 +125,51 @@ def _cell(value: str | float | bool | None) -> str:
     return ("no", "yes")[value] if isinstance(value, bool) else f"{value:.4g}"
 
 
+def read_table(path: Path) -> list[Row]:
+    """Read all rows of a Parquet file; none if there is no file yet; raises InputError if it is another one."""
+    if not path.exists():
+        return []
+    try:
+        return [Row(**record) for record in pq.read_table(path).to_pylist()]
+    except (OSError, pa.ArrowException, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f"{path}: expected results of `sonotwin accuracy`, found {reason}; another `out`?") from error
+
+
+def write_table(path: Path, group: str, measured: Sequence[Row]) -> None:
+    """Replace a group's rows in a Parquet file, with all digits."""
+    with atomic.new_file(path) as temporary:
+        records = [asdict(row) for row in renewed(read_table(path), group, measured)]
+        pq.write_table(pa.Table.from_pylist(records, schema=SCHEMA), temporary)
+
+
+SCHEMA = pa.schema(
+    (
+        field.name,
+        pa.bool_() if field.name == "met" else pa.float64() if field.name in ("measured", "bar", "limit") else pa.string(),
+    )
+    for field in fields(Row)
+)
+
+
 def enter(document: Path, choices: Sequence[Chosen], group: str, measured: Sequence[Row]) -> None:
-    """Replace a group's rows in the file beside a document, with today and the commit, and make the document's table anew.
+    """Replace a group's rows in the file beside a document, and make the document's table anew.
 
     The file is locked from reading to writing, so that two processes that enter different groups lose none.
     """
-    day, commit = table_rows.state(document.parent)
     path = file_of(document)
     with atomic.new_file(path) as temporary:
-        rows = renewed(read(path), group, [kept(group, row, day, commit) for row in measured])
+        rows = renewed(read(path), group, measured)
         write(temporary, rows)
-        table_rows.enter(document, MARK, short_table(rows, choices))
+        document_tables.enter(document, MARK, short_table(rows, choices))
 
 
 def show(document: Path, choices: Sequence[Chosen]) -> None:
     """Make a document's table anew of the file beside it, after a change of the choices."""
-    table_rows.enter(document, MARK, short_table(read(file_of(document)), choices))
+    document_tables.enter(document, MARK, short_table(read(file_of(document)), choices))
 
 
-def renewed(rows: Sequence[Kept], group: str, measured: Sequence[Kept]) -> list[Kept]:
+def renewed(rows: Sequence[Row], group: str, measured: Sequence[Row]) -> list[Row]:
     """Rows with those of a group replaced where they stood; a new group comes last."""
     place = next((k for k, row in enumerate(rows) if row.group == group), len(rows))
     before = [row for row in rows[:place] if row.group != group]
@@ -161,12 +193,12 @@ def read_choices(path: Path) -> list[Chosen]:
     return found
 
 
-def chosen_rows(rows: Sequence[Kept], choice: Chosen) -> list[Kept]:
+def chosen_rows(rows: Sequence[Row], choice: Chosen) -> list[Row]:
     """Rows that fit a choice."""
     return [row for row in rows if any(fnmatchcase(f"{row.group} {row.id} {row.what}", pattern) for pattern in choice.rows)]
 
 
-def short_table(rows: Sequence[Kept], choices: Sequence[Chosen]) -> str:
+def short_table(rows: Sequence[Row], choices: Sequence[Chosen]) -> str:
     """The table of a document: a line a choice, missed ones first; a missed row that no choice covers has a line of its own."""
     covered = {row for choice in choices for row in chosen_rows(rows, choice)}
     choices = [*choices, *(_alone(row) for row in rows if row.met is False and row not in covered)]
@@ -181,17 +213,26 @@ def short_table(rows: Sequence[Kept], choices: Sequence[Chosen]) -> str:
     return "\n".join([head, "", names, *missed, *lines])
 
 
-def _alone(row: Kept) -> Chosen:
+def _alone(row: Row) -> Chosen:
     return Chosen(row.what, f"{row.group}, row {row.id}", ())
 
 
-def _line(choice: Chosen, row: Kept | None, count: int) -> str:
+def _line(choice: Chosen, row: Row | None, count: int) -> str:
     if row is None:
         return f"| {choice.quantity} | {choice.conditions} | not measured | | | | |"
     found = search(r"[(;] ?paper(?:, [\w ]+)?: ([^);]+)", row.what)
     paper = " to ".join(dict.fromkeys(found[1].split(" to "))) if found else ""  # 0.04 to 0.04 is one figure
     figure = f"{row.measured:.4g} {row.unit}".strip() + (f", worst of {count}" if count > 1 else "")
-    asked = "" if row.bar is None else f"{row.sense} {row.bar:.4g}"
     beside = "" if row.limit is None or math.isnan(row.limit) else f"{row.limit:.4g}"
     met = {None: "", True: "yes", False: "**no**"}[row.met]
-    return f"| {choice.quantity} | {choice.conditions} | {figure} | {asked} | {beside} | {paper} | {met} |"
+    return f"| {choice.quantity} | {choice.conditions} | {figure} | {row.asked} | {beside} | {paper} | {met} |"
+
+
+def whole_table(rows: Sequence[Row], limit: str) -> str:
+    """All rows as a Markdown table; `limit` heads the column of what they are compared with."""
+    lines = [f"| id | what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|---|"]
+    for row in rows:
+        beside = "" if row.limit is None else f"{row.limit:.4g}"
+        met = {None: "", True: "yes", False: "**no**"}[row.met]
+        lines.append(f"| {row.id} | {row.what} | {row.measured:.4g} | {row.asked} | {beside} | {row.unit} | {met} |")
+    return "\n".join(lines)

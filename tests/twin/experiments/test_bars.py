@@ -1,0 +1,149 @@
+"""Bars: rows of figures, what is measured once, and that the documents' rows are those of conf/bars."""
+
+import inspect
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from recon.errors import InputError
+from tests.twin.experiments.asked import CONF, FILES, experiments
+from twin.engine import Engine
+from twin.experiments import bars, result_rows
+from twin.experiments.experiment_setup import Setup
+from twin.experiments.kept_figures import Kept
+
+NUMBER = r"([-+.\de]+|nan|inf)"
+BEFORE = "bracket that gives over the wires, over switching"  # a row of before the bracket in the scan was counted, too
+CALLS = Counter()
+
+
+def doubled(setup: Setup, length_mm: float) -> dict[str, float]:
+    """An experiment."""
+    CALLS[length_mm] += 1
+    return {"double_mm": 2 * length_mm, "limit_mm": length_mm} | ({"odd_mm": 1.0} if length_mm == 3 else {})
+
+
+ENTRIES = f"""
+- of: {__name__}.doubled
+  about: "{{length_mm:g}} mm"
+  over: {{length_mm: [1.0, 3.0]}}
+  words: {{most: 5.0}}
+  rows:
+    - {{id: a, figure: double_mm, what: "{{about}}: double", most: most, limit: limit_mm, unit: mm}}
+    - {{id: b, figure: double_mm, what: "{{about}}, {{name}}: double", least: "1.5 {{of}}", each: {{name: [x], of: [limit_mm]}}}}
+    - {{id: c, figure: odd_mm, what: "{{about}}: odd", optional: true}}
+- {{of: {__name__}.missing, needs: real, rows: []}}
+"""
+
+
+@pytest.fixture
+def group(tmp_path) -> list[bars.Experiment]:
+    (tmp_path / "group.yaml").write_text(ENTRIES)
+    CALLS.clear()
+    return bars.read(tmp_path / "group.yaml")
+
+
+def test_rows_have_words_bars_and_limits(group, rig):
+    """Bars in both directions, by numbers and by figures; a figure that isn't there is left out where that is allowed."""
+    rows = list(bars.measure(group, Setup(rig), None, Engine()))
+    assert [(row.id, row.what, row.measured, row.sense, row.bar, row.limit, row.met) for row in rows] == [
+        ("a", "1 mm: double", 2.0, "<=", 5.0, 1.0, True),
+        ("b", "1 mm, x: double", 2.0, ">=", 1.5, None, True),
+        ("a", "3 mm: double", 6.0, "<=", 5.0, 3.0, False),
+        ("b", "3 mm, x: double", 6.0, ">=", 4.5, None, True),
+        ("c", "3 mm: odd", 1.0, "", None, None, None),
+    ]
+    assert (rows[0].group, rows[0].figure, rows[0].settings) == ("group", "double_mm", '{"length_mm": 1.0}')
+
+
+def test_no_number_meets_no_bar(group):
+    (row, *_) = group[0].rows({"double_mm": float("nan"), "limit_mm": 1.0})
+    assert row.met is False
+
+
+def test_a_figure_that_is_missing_is_an_error(group):
+    with pytest.raises(KeyError, match="limit_mm"):
+        group[0].rows({})
+
+
+def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monkeypatch):
+    """Measured once; anew for another rig; those that aren't of the twin's own code are measured each time."""
+    kept, setup = Kept(tmp_path / "kept"), Setup(rig)
+    kept.open()
+    first, again = (list(bars.measure(group, setup, kept, Engine())) for _ in range(2))
+    assert first == again and CALLS == {1.0: 2, 3.0: 2}
+    monkeypatch.setattr(bars, "OURS", __name__.partition(".")[0])
+    CALLS.clear()
+    other = rig.model_copy(update={"target": rig.target.model_copy(update={"c1_mm": 30.0})})
+    for each in (setup, setup, Setup(other)):
+        assert list(bars.measure(group, each, kept, Engine())) == first
+    assert CALLS == {1.0: 2, 3.0: 2}
+
+
+@pytest.mark.parametrize(
+    ("entry", "complaint"),
+    [("{of: a.b, row: []}", "entry 1: rows: "), ("{of: a.b, rows: [{id: a}]}", r"entry 1: rows.0.figure: ")],
+)
+def test_a_broken_file_is_refused(entry, complaint, tmp_path):
+    (tmp_path / "group.yaml").write_text(f"- {entry}\n")
+    with pytest.raises(InputError, match=complaint):
+        bars.read(tmp_path / "group.yaml")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_experiments_take_their_settings(path):
+    """Each is there, and has a parameter for each setting and none besides that must be given."""
+    for one in experiments(path):
+        inspect.signature(one.function).bind(None, **one.settings)
+
+
+class Anything(dict):
+    """Figures that nobody has measured, each of any number."""
+
+    def __missing__(self, name: str) -> "Unknown":
+        return Unknown()
+
+
+class Unknown(float):
+    """A number in a text."""
+
+    def __format__(self, form: str) -> str:
+        return "\0"
+
+
+def test_the_documents_rows_are_those_of_the_bars():
+    """Each row of docs/accuracy.csv is one of conf/bars, with its words, unit, bar and limit: none is put in by hand."""
+    patterns = [
+        (path.stem, figure.id, re.compile(re.escape(text).replace("\0", NUMBER)), figure)
+        for path in FILES
+        if path.parent.name == "accuracy"
+        for one in experiments(path)
+        for figure in one.figures
+        for text in texts(one, figure)
+    ]
+    for row in result_rows.read(CONF.parent / "docs" / "accuracy.csv"):
+        fit = [f for group, id, text, f in patterns if (group, id) == (row.group, row.id) and text.fullmatch(row.what)]
+        fit = [f for f in fit if ("" if f.most is f.least is None else "<=" if f.least is None else ">=") == row.sense]
+        assert len(fit) == 1 or BEFORE in row.what, row
+        for figure in fit:
+            assert figure.unit in (row.unit, "") or "{" in figure.unit
+            for given, found in ((figure.most, row.bar), (figure.least, row.bar), (figure.limit, row.limit)):
+                assert not isinstance(given, int | float) or given == pytest.approx(found, rel=1e-3)
+
+
+def texts(one: bars.Experiment, figure: bars.Figure):
+    """Texts of a figure's rows, a zero for each number that isn't known before."""
+    for values in zip(*figure.each.values(), strict=True) if figure.each else [()]:
+        known = Anything({**one.settings, **one.words, **dict(zip(figure.each, values, strict=True))})
+        known["about"] = one.about.format_map(known)
+        yield figure.what.format_map(known)
+
+
+def test_all_groups_have_a_file():
+    from sonotwin.verbs.accuracy import Group
+
+    assert {path.stem for path in FILES if path.parent.name == "accuracy"} == set(Group.__args__)
+    document = Path(CONF.parent / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    assert {path.stem for path in FILES if path.parent.name == "benchmark"} == set(re.findall(r"<!-- (\w+) -->", document))

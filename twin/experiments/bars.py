@@ -1,0 +1,146 @@
+"""Experiments with bars: a YAML file says which are run with which settings, and of each figure its words, unit, bar and limit.
+
+An experiment is a function of what all have at hand (`Setup`) and of settings of its own; it gives figures by name. So a group of
+accuracy, and one of speed, is a list of such entries in `conf/bars/`.
+"""
+
+import itertools
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field
+
+from recon.errors import validated
+from recon.files import yaml_text
+from recon.files.metrics import Metrics
+from recon.model.part import Part
+from twin.engine import Engine
+from twin.experiments import experiment_runs, virtual_screen
+from twin.experiments.experiment_setup import Figures, Setup, digest_of
+from twin.experiments.kept_figures import Kept
+from twin.experiments.result_rows import Row
+
+OURS = "twin"  # package whose experiments depend on code and settings alone
+Number = float | str | None  # a number, or a figure by its name, maybe as `1.25 limit_mm` or `limit_mm / 1.5`
+
+
+class Figure(Part):
+    """A figure's row; texts may have `{name}` of settings, of `each`, of figures, and `{about}` of the entry."""
+
+    id: str
+    figure: str
+    what: str
+    unit: str = ""
+    most: Number = None  # the bar
+    least: Number = None  # the bar, where at least that is asked
+    limit: Number = None
+    each: dict[str, tuple[Any, ...]] = Field(default_factory=dict)  # values that the row is repeated for, in step
+    optional: bool = False  # left out where the experiment has no such figure
+
+    def rows(self, experiment: "Experiment", figures: Figures) -> Iterator[Row]:
+        """The rows of measured figures."""
+        for values in zip(*self.each.values(), strict=True) if self.each else [()]:
+            known = {**figures, **experiment.settings, **experiment.words, **dict(zip(self.each, values, strict=True))}
+            known["about"] = experiment.about.format(**known)
+            name = self.figure.format(**known)
+            if self.optional and name not in figures:
+                continue
+            asked, limit = (_number(given, known) for given in (self.most if self.least is None else self.least, self.limit))
+            sense, measured = "" if asked is None else "<=" if self.least is None else ">=", float(figures[name])
+            met = None if asked is None else bool(measured <= asked if sense == "<=" else measured >= asked)
+            settings = json.dumps(experiment.settings, sort_keys=True)
+            yield Row(
+                *(experiment.group, self.id, self.what.format(**known), measured, sense, asked, limit, self.unit, met),
+                **{"experiment": experiment.of, "settings": settings, "figure": name},
+            )
+
+
+class Entry(Part):
+    """An experiment in a group's file."""
+
+    of: str  # dotted name of its function
+    about: str = ""  # beginning of its rows
+    over: dict[str, tuple[Any, ...]] = Field(default_factory=dict)  # settings whose combinations are measured one by one
+    settings: dict[str, Any] = Field(default_factory=dict)
+    words: dict[str, Any] = Field(default_factory=dict)  # that texts and bars may use, too
+    needs: Literal["real", "screen", None] = None  # recordings, or a virtual screen; left out without
+    rows: tuple[Figure, ...]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One measurement: a function with its settings, and the rows of its figures."""
+
+    group: str
+    of: str
+    about: str
+    settings: Mapping[str, Any]
+    words: Mapping[str, Any]
+    needs: str | None
+    figures: tuple[Figure, ...]
+
+    @property
+    def function(self) -> Callable[..., Figures]:
+        """What measures."""
+        module, _, name = self.of.rpartition(".")
+        return getattr(import_module(module), name)
+
+    def at_hand(self, setup: Setup) -> bool:
+        """Whether what it needs is there."""
+        return {None: True, "real": setup.real is not None, "screen": bool(virtual_screen.installed())}[self.needs]
+
+    def rows(self, figures: Figures) -> list[Row]:
+        """Rows of figures that were measured."""
+        return [row for one in self.figures for row in one.rows(self, figures)]
+
+    def key(self, setup: Setup) -> str:
+        """Digest of all that its figures depend on."""
+        return digest_of([experiment_runs.version(), self.of, self.settings, setup.digest])
+
+
+def read(path: Path) -> list[Experiment]:
+    """Read a group, `conf/bars/accuracy/GROUP.yaml`; raises InputError with the field that is wrong."""
+    entries = [validated(Entry, entry, f"{path}: entry {k + 1}") for k, entry in enumerate(yaml_text.read(path))]
+    return [
+        Experiment(
+            path.stem, one.of, one.about, one.settings | dict(zip(one.over, values, strict=True)), one.words, one.needs, one.rows
+        )
+        for one in entries
+        for values in itertools.product(*one.over.values())
+    ]
+
+
+def measure(experiments: Sequence[Experiment], setup: Setup, kept: Kept | None, engine: Engine) -> Iterator[Row]:
+    """Measure what can be measured, and give the rows in the order of the file as soon as they are there.
+
+    kept : for experiments of the twin, whose figures depend on code and settings alone; the command's own keep their parts
+    """
+    there = [one for one in experiments if one.at_hand(setup)]
+    keys = {id(one): one.key(setup) for one in there if one.of.startswith(f"{OURS}.")} if kept else {}
+    tasks = {keys[id(one)]: (one, setup) for one in there if id(one) in keys}
+    running, done = kept.run(engine, _figures, tasks) if kept else iter(()), dict[str, Any]()
+    for one in there:
+        key = keys.get(id(one), "")
+        while key in tasks and key not in done:
+            done |= [next(running)]
+        yield from one.rows(done[key] if key in tasks else one.function(setup, **one.settings))
+
+
+def _figures(key: str, one: Experiment, setup: Setup) -> tuple[str, Metrics]:
+    """Measure on any machine."""
+    return key, {name: float(value) for name, value in one.function(setup, **one.settings).items()}
+
+
+def _number(given: Number, known: Figures) -> float | None:
+    """A number as it is given, or of a figure."""
+    if not isinstance(given, str):
+        return given
+    if (name := given.format(**known)) in known:
+        return float(known[name])
+    product, _, divisor = name.partition(" / ")
+    factor, _, name = product.rpartition(" ")
+    return float(factor or 1) * float(known[name]) / float(divisor or 1)
