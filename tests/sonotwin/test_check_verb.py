@@ -93,7 +93,7 @@ def test_poses_of_the_bottom_may_be_in_track_s_folder(bottom, tmp_path, capsys):
 
 SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it
 LIFE = ["conditions=lifelike", f"seed={SEED}"]
-RENDERED = ["cameras=[cam1,cam2]", "scene=breast", "patterns=paper_calibration", "tracing.samples=8", *LIFE]
+RENDERED = ["cameras=[cam1,cam2]", "scene=breast", "patterns=paper_calibration", "tracing.samples=4", *LIFE]
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def drifted(rig, tmp_path_factory):
     """A folder with a calibration that errs as it says, and a film of the target by cameras that have drifted since."""
     folder = tmp_path_factory.mktemp("drifted")
     calibration_files.write(folder / "optics.yaml", calibrated_optics(rig, IDEAL, Noise(), Poses(), SEED))
-    assert main(["film", f"out={folder}", "frames=30", "path.turn_deg=20", "white_dn=120", *LIFE]) == 0
+    assert main(["film", f"out={folder}", "frames=16", "path.turn_deg=20", "white_dn=120", *LIFE]) == 0
     return folder
 
 

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import webdataset as wds
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recon.errors import InputError, brief, one_line
@@ -174,10 +173,12 @@ def generate(place: Place, settings: Settings, missing: Sequence[int], engine: E
 
 def write_shard(place: Place, settings: Settings, number: int) -> int:
     """Render a shard's samples and write them; gives their number."""
+    import webdataset  # with torch, where it is installed: seconds that a refusal and the help do without
+
     bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
     samples = settings.samples_of(number)
     shard = atomic.listed_file(place.folder, place.shard(number).name, BY)
-    with shard as path, wds.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
+    with shard as path, webdataset.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
         for first in range(samples.start, samples.stop, BATCH):
             takes = [draw(settings.ranges, settings.rig, settings.seed, k) for k in samples if first <= k < first + BATCH]
             rendered = RENDER[settings.frames](bank, settings.rig, takes, settings.quality, settings.seed)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import webdataset
 
 from recon.errors import InputError
 from tests.twin.tracking.takes import ranges, rig
@@ -50,8 +51,8 @@ def test_a_killed_run_goes_on_to_the_same_bytes(made, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return write(tar, sample)
 
-    write = dataset_shards.wds.TarWriter.write
-    monkeypatch.setattr(dataset_shards.wds.TarWriter, "write", dies)
+    write = webdataset.TarWriter.write
+    monkeypatch.setattr(webdataset.TarWriter, "write", dies)
     with pytest.raises(KeyboardInterrupt):
         list(generate(place, wanted, prepare(place, wanted), Engine()))
     assert not list(place.folder.glob("*.tar"))
