@@ -89,10 +89,9 @@ def test_files_and_modules_that_pages_name_exist(page):
             parts.pop()  # a function or class of a module
         folder = ROOT / Path(*parts)
         rest = name.split(".")[len(parts) :]
-        module = folder / "__init__.py" if folder.is_dir() else folder.with_suffix(".py")
-        known = module.is_file() and all(
-            re.search(rf"\b{re.escape(part)}\b", module.read_text(encoding="utf-8")) for part in rest
-        )
+        files = [folder / "__init__.py", folder / "__init__.pyi"] if folder.is_dir() else [folder.with_suffix(".py")]
+        text_of_code = "".join(file.read_text(encoding="utf-8") for file in files if file.is_file())
+        known = all(re.search(rf"\b{re.escape(part)}\b", text_of_code) for part in rest)
         assert known or not rest, name
 
 
