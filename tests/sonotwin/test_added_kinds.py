@@ -1,4 +1,4 @@
-"""A board, and dialects of probes' calibrations, clips and tracked sequences, are each added by one module, found by its name."""
+"""Boards, and dialects of probes, clips, tracked sequences and captures, are each added by one module, found by its name."""
 
 import cv2
 import numpy as np
@@ -6,12 +6,13 @@ import pytest
 
 from recon.artwork import board_drawing
 from recon.board_detection.detect import detect
-from recon.capture import probe_files
+from recon.capture import calibration_files, probe_files
 from recon.clips import clip_reader
 from recon.freehand import sequences
 from recon.model.boards import Board
 from sonotwin.cli import main
 from tests import added
+from tests.recon.tracking import films
 
 NOTCHED = '''"""A square grid of discs without its last one: no turn maps it onto itself."""
 
@@ -149,3 +150,31 @@ def test_another_dialect_of_tracked_sequences_is_one_module(monkeypatch, tmp_pat
     read = sequences.read_sequence(tmp_path / "sweep.npz")
     assert np.array_equal(read.images, images) and sequences.image_shape(tmp_path / "sweep.npz") == (20, 30)
     assert np.array_equal(sequences.poses(read, "Tracker", "Probe"), poses)
+
+
+OPTICS_ALONE = '''"""A folder with a file of cameras."""
+
+from recon.capture import calibration_files
+
+
+def read_capture(folder, known):
+    """Read the cameras."""
+    optics = calibration_files.read(folder / "cameras.yaml")
+
+    def fill(capture):
+        capture.add_calibration(optics)
+        return [f"optics      {', '.join(optics.cameras)}, {known.camera_hz:g} frames a second"]
+
+    return fill
+'''
+
+
+def test_another_layout_of_captures_is_one_module(monkeypatch, tmp_path, rig, capsys):
+    added.add(monkeypatch, tmp_path / "ours", "recon.capture.layouts", "optics_alone", OPTICS_ALONE)
+    (tmp_path / "theirs").mkdir()
+    calibration_files.write(tmp_path / "theirs" / "cameras.yaml", films.optics(rig))
+    fields = ["layout=optics_alone", f"folder={tmp_path / 'theirs'}", "camera_hz=25", f"out={tmp_path / 'capture'}"]
+    assert main(["import", *fields]) == 0
+    assert "optics      cam1, cam2, 25 frames a second" in capsys.readouterr().out
+    held = calibration_files.of_capture(tmp_path / "capture", None)
+    assert np.array_equal(held.cameras["cam2"].matrix, rig.cam2.optics.camera().matrix)
