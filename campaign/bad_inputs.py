@@ -15,7 +15,7 @@ from rich.progress import track
 
 from campaign import commands, field_faults, sources
 from campaign.byte_faults import Fault, faults_of_any_file
-from campaign.commands import Outcome
+from campaign.commands import Outcome, Run
 from campaign.kind_faults import faults_of_kind
 from campaign.sources import COMMANDS, Command
 
@@ -105,13 +105,13 @@ def chosen(found: Sequence[Case], count: int, seed: int) -> list[Case]:
     return taken
 
 
-def run(found: Sequence[Case], place: Path, workers: int) -> list[Result]:
+def run(found: Sequence[Case], place: Path, workers: int, command: Run = commands.run) -> list[Result]:
     """Run cases, each in a folder of its own."""
     with ThreadPoolExecutor(workers) as pool:
-        return list(track(pool.map(partial(run_one, place), found), "bad inputs", len(found)))
+        return list(track(pool.map(partial(run_one, place, command), found), "bad inputs", len(found)))
 
 
-def run_one(place: Path, case: Case) -> Result:
+def run_one(place: Path, command: Run, case: Case) -> Result:
     """Run one case on links to the sources in `place`."""
     with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
         folder = Path(name)
@@ -119,7 +119,7 @@ def run_one(place: Path, case: Case) -> Result:
         field_faults.lay_out(folder)
         if case.damage is not None:
             case.damage(folder)
-        return Result(case, commands.run(case.line, folder, GIVE_UP_S))
+        return Result(case, command(case.line, folder, GIVE_UP_S))
 
 
 def controls(place: Path, workers: int) -> list[Result]:

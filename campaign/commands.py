@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -32,6 +32,9 @@ class Outcome:
         """Whether it ended as bad input must: status 2, one line by us, nothing written."""
         lines = self.said.splitlines()
         return self.status == 2 and len(lines) == 1 and lines[0].startswith("sonotwin: ") and not self.changed
+
+
+Run = Callable[[Sequence[str], Path, float], Outcome]  # of arguments in a folder, for some seconds at most
 
 
 def run(arguments: Sequence[str], folder: Path, longest_s: float) -> Outcome:

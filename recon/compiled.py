@@ -12,9 +12,11 @@ import ast
 import hashlib
 import logging
 import os
+import pickle
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -117,8 +119,25 @@ def _imported_for_kernels(text: _Text, root: Path, taken: frozenset[str]) -> tup
 
 @cache
 def _parsed(path: Path, _: int) -> _Text:
-    """The text of a module, of a time."""
-    tree = ast.parse(path.read_bytes())
+    """The text of a module, of a time; parsed once for all processes, as that takes half of the time to import a kernel."""
+    source = path.read_bytes()
+    stamp = hashlib.sha256(Path(__file__).read_bytes() + b"\0" + source).digest()
+    kept = user_cache.compiled_code() / "texts" / hashlib.sha256(str(path).encode(errors="surrogateescape")).hexdigest()[:20]
+    with suppress(OSError, EOFError, pickle.UnpicklingError):
+        content = kept.read_bytes()
+        if content.startswith(stamp):
+            return pickle.loads(content[len(stamp) :])
+    text = _read(source)
+    with suppress(OSError):
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        temporary = kept.with_name(f".{kept.name}.{os.getpid()}")
+        temporary.write_bytes(stamp + pickle.dumps(text))
+        temporary.replace(kept)
+    return text
+
+
+def _read(source: bytes) -> _Text:
+    tree = ast.parse(source)
     imported = _imported(tree)
     plain = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef) and not node.decorator_list}
     others = [node for node in tree.body if not isinstance(node, ast.FunctionDef) or node.decorator_list]

@@ -16,6 +16,7 @@ from recon.model.rig import Positive
 from scenes.acoustics import made_of
 from sonotwin import choices
 from sonotwin.verbs import render, sweep
+from twin.optics.light_transport import Samples
 from twin.ultrasound.sweep_session import AnyPath
 from twin.ultrasound.timed_sweep import Clocks
 from twin.ultrasound.transducer import Transducer, check_scanner
@@ -39,6 +40,7 @@ class Settings(render.Config):
     clocks: Clocks = Clocks(camera_hz=16.0)
     wires: Annotated[int, Field(ge=1, le=1000)] = 40
     bottom_s: Positive = 5.0
+    board_samples: Samples | None = None  # rays a pixel of the board's images at most
 
     @model_validator(mode="after")
     def _fits_poses(self) -> "Settings":
@@ -103,15 +105,18 @@ def parts(chosen: Settings, out: Path, bottom_hz: float = inf) -> Iterator[Rende
 
 
 def board(chosen: Settings, out: Path, add: bool = True) -> render.Config:
-    """Settings of the calibration board, which has an exposure of its own."""
+    """Settings of the calibration board, which has an exposure and a number of rays of its own."""
     assert chosen.poses is not None
     shooting = chosen.shooting.model_copy(update={"exposure_s": None})
+    tracing = chosen.tracing
+    if chosen.board_samples is not None:
+        tracing = tracing.model_copy(update={"samples": min(tracing.samples, chosen.board_samples)})
     own = {
         "scene": choices.read("scene", "board"),
         "patterns": choices.read_patterns("paper_calibration"),
         "cameras": ["cam1", "cam2"],
     }
-    own |= {"poses": chosen.poses, "shooting": shooting, "out": out, "add": add}
+    own |= {"poses": chosen.poses, "shooting": shooting, "tracing": tracing, "out": out, "add": add}
     return render.Config.model_validate(_shared(chosen) | own)
 
 

@@ -94,7 +94,7 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
 def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
     """Outside, inside, and the report of both."""
     out = tmp_path / "demo"
-    assert main(["demo", "conditions=ideal", "wires=30", "bottom_s=4", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
+    assert main(["demo", "conditions=ideal", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     assert not [name for name in (*MADE, *MADE_INSIDE) if not (out / name).is_file()]
     metrics = figures(out)
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
@@ -240,7 +240,7 @@ def test_each_part_has_the_demonstrations_settings(overrides, tmp_path):
     """The demonstration's fields reach each part, but for those that it sets itself; the others are its verb's own defaults."""
     config = load("demo", overrides, Config)
     own = {
-        "board": {"scene", "patterns", "cameras", "shooting"},
+        "board": {"scene", "patterns", "cameras", "shooting", "tracing"},
         "render": {"poses"},
         "wires": {"scene", "path", "ultrasound", "clocks"},
         "bottom": {"scene", "path", "ultrasound"},

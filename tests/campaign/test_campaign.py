@@ -9,6 +9,7 @@ import pytest
 from campaign import (
     bad_inputs,
     foreign,
+    forked,
     full_disk,
     fuzzing,
     kills,
@@ -37,7 +38,8 @@ def test_bad_inputs_are_refused(place):
     """Some of every verb's whose sources are quickly made; how long they take isn't tested: machines are noisy."""
     few = [command for command in COMMANDS if set(command.folders) <= NAMES and not command.minutes]
     chosen = bad_inputs.chosen(bad_inputs.cases(place, few), COUNT, seed=21)
-    found = bad_inputs.run(chosen, place, workers=1)
+    with forked.copies() as command:
+        found = bad_inputs.run(chosen, place, workers=1, command=command)
     wrong = {f"{one.case.command.verb} {one.case.fault}": (one.fault, one.outcome.said) for one in found if one.fault}
     assert not {name: fault for name, fault in wrong.items() if fault[0] != "slow"}
 

@@ -215,3 +215,25 @@ def test_the_range_of_versions_is_that_of_the_project():
 def test_a_cache_that_cannot_be_written_is_no_fault(clone):
     (clone.parent / "cache").write_text("a file where the folder should be")
     assert run(clone)[0] == 42
+
+
+def test_a_module_is_parsed_once_for_all_processes(tmp_path, monkeypatch):
+    """Anew after a change, and where what is kept was cut short or can't be."""
+    monkeypatch.setattr(compiled.user_cache, "compiled_code", lambda: tmp_path / "cache")
+    read, module, parsed = compiled._read, tmp_path / "module.py", []
+    monkeypatch.setattr(compiled, "_read", lambda source: parsed.append(source) or read(source))
+
+    def look(source: bytes) -> set:
+        module.write_bytes(source)
+        return compiled._parsed.__wrapped__(module, 0).used
+
+    one, other = b"from recon import threads\nA = threads.B", b"from recon import threads\nA = threads.C"
+    assert [look(one), look(one), look(other), look(other)] == [{("threads", "B")}] * 2 + [{("threads", "C")}] * 2
+    assert parsed == [one, other]
+    (kept,) = (tmp_path / "cache" / "texts").iterdir()
+    kept.write_bytes(kept.read_bytes()[:40])
+    assert look(other) == {("threads", "C")} and parsed == [one, other, other]
+    kept.unlink()
+    kept.parent.rmdir()
+    kept.parent.write_text("a file in its place")
+    assert look(other) == {("threads", "C")} and len(parsed) == 4

@@ -5,11 +5,13 @@ values of all N patterns at that projector pixel are looked up and added, each t
 once, not N times.
 """
 
+from typing import Annotated
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field
 
 from recon.model.rig import NotNegative, Part
 from twin.optics.instruments import CameraOptics, ProjectorOptics, light_point, sample_rays
@@ -23,19 +25,21 @@ Images = NDArray[np.float32]
 LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793), to turn room light in lux into W/mm^2
 
 
+def _power_of_two(value: int) -> int:
+    if value & (value - 1):
+        raise ValueError(f"expected a power of two, found {value}")
+    return value
+
+
+Samples = Annotated[int, Field(ge=2, le=65536), AfterValidator(_power_of_two)]
+
+
 class Tracing(Part):
     """Settings of the path tracer."""
 
-    samples: int = Field(default=16, ge=2, le=65536)  # paths a pixel, a power of two
+    samples: Samples = 16  # paths a pixel
     bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector and camera; 1 is direct light
     room_lux: NotNegative = 0.0  # illuminance on an unshadowed surface, even from all sides
-
-    @field_validator("samples")
-    @classmethod
-    def _power_of_two(cls, value: int) -> int:
-        if value & (value - 1):
-            raise ValueError(f"expected a power of two, found {value}")
-        return value
 
     @property
     def room_radiance(self) -> float:
