@@ -20,8 +20,8 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.session.optics_step import dropped
 from sonotwin.cli import main
-from sonotwin.verbs.calibrate_optics import dropped
 from tests.recon import board_views
 
 SIZE = (320, 256)
