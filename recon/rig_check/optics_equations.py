@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from recon.estimation.covariance import root, whitening
-from recon.estimation.equations import eliminate
+from recon.estimation.equations import Rows, eliminate
+from recon.estimation.levenberg_marquardt import Rules, descend
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import MOTION, moved
 from recon.geometry.circle_outline import ellipses_of, slopes_at
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import circle_layout
-from recon.model.calibration import Calibration, Uncertainty, projection_slopes
-from recon.model.circle_layout import Circles
+from recon.model.calibration import Calibration, Uncertainty, linearise
 from recon.model.rig import Target
 from recon.rig_check import fault_tests
 from recon.rig_check.fault_tests import Equations, Fault
@@ -35,7 +35,7 @@ CAMERAS, PROJECTOR, TARGET = ("cam1", "cam2"), "projector", "target"
 USUAL_MOTION = np.repeat([np.deg2rad(0.03), 0.1], 3)  # rad and mm: a mount that creeps, a touch; larger ones show all the better
 USUAL_LENGTH = 0.3  # mm: another print, a bent board
 EXACT_PX = 1e-4  # of a camera's pixel at which a map is read
-ROUNDS = 3  # of a pose's fit
+RULES = Rules(damping=0, rounding=1e-6, converged=0, steps=3)  # of a pose's fit, from where rays meet
 OUTLYING = 5.0  # standard deviations, after the scale of all
 TRIMS = 4  # rounds in which points that disagree are left out
 
@@ -91,41 +91,37 @@ def _of_pair(pair: tuple[Sighting, Sighting], target: Target, names: Sequence[st
     model, circles = circle_layout.circle_centres(target), circle_layout.circles(target)
     pose = aligned(model, meet([view.camera for view in pair], [view.centres for view in pair])[0])
     whiten = block_diag(*(whitening(noise) for view in pair for noise in view.covariance))
-    for _ in range(ROUNDS):
-        by_pose, missing = _by_pose(pair, pose, circles)
-        pose = rigid.moved(pose, np.linalg.lstsq(whiten @ by_pose, whiten @ missing)[0])
-    by_pose, missing = _by_pose(pair, pose, circles)
+
+    def centre_rows(pose: Array) -> tuple[Rows, float]:
+        """Of the ellipses' centres, by the pose."""
+        points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
+        slopes = np.concatenate([slopes_at(view.camera, points) @ rigid.slopes(arms) for view in pair])
+        missing = np.concatenate([view.centres - ellipses_of(view.camera, pose, *circles)[0] for view in pair])
+        left = whiten @ missing.ravel()
+        return Rows(whiten @ slopes.reshape(-1, 6), left), float(left @ left)
+
+    pose, (by_pose, left), *_ = descend(pose, centre_rows, rigid.moved, rules=RULES)
     points = rigid.apply(pose, circles.centres)
-    by_point = np.concatenate([slopes_at(view.camera, points) for view in pair])  # (2 n, 2, 3)
-    by_length = by_point @ np.concatenate([pose[:3, :3] @ circle_layout.by_length(target)] * 2)
-    by_length = by_length.reshape(len(whiten), -1)
     cameras = {name: view.camera for name, view in zip(CAMERAS, pair, strict=True)}
-    by_optics = projection_slopes(cameras, [points, points], names)
-    return whiten @ by_pose, whiten @ np.column_stack([missing, by_optics, by_length])
-
-
-def _by_pose(pair: tuple[Sighting, Sighting], pose: Array, circles: Circles) -> tuple[Array, Array]:
-    """Slopes : (4 n, 6) of the ellipses' centres by the pose, and their residuals : (4 n,) px."""
-    points, arms = rigid.apply(pose, circles.centres), rigid.rotate(pose, circles.centres)
-    slopes = [slopes_at(view.camera, points) @ rigid.slopes(arms) for view in pair]
-    missing = [view.centres - ellipses_of(view.camera, pose, *circles)[0] for view in pair]
-    return np.concatenate(slopes).reshape(-1, 6), np.concatenate(missing).ravel()
+    seen = [linearise(cameras, name, points, names) for name in CAMERAS]
+    by_point, by_optics = (np.concatenate(each) for each in zip(*((one.by_point, one.by_parameter) for one in seen), strict=True))
+    by_length = by_point @ np.concatenate([pose[:3, :3] @ circle_layout.by_length(target)] * 2)
+    rest = whiten @ np.concatenate([by_optics, by_length], axis=2).reshape(len(whiten), -1)
+    return by_pose, np.column_stack([left, rest])
 
 
 def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, names: Sequence[str]) -> DeviceRows:
     """Equations of m points: one each with fringes along one axis of the projector, three with both."""
     axes, (m, k) = list(matches.axes), matches.first.shape
     points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
-    by_point = {name: slopes_at(cameras[name], points) for name in (*CAMERAS, PROJECTOR)}
-    by_optics = {
-        name: projection_slopes({name: cameras[name]}, [points], names).reshape(m, 2, -1) for name in (*CAMERAS, PROJECTOR)
-    }
-    shown = cameras[PROJECTOR].project(points)[:, axes]
-    rows = []
-    for slopes in (by_point, by_optics):  # a map is read at camera 2's predicted pixel, not at that of the point
-        light = slopes[PROJECTOR][:, axes]
-        rows.append(np.concatenate([slopes["cam1"], light, light - matches.gradient @ slopes["cam2"]], axis=1))
-    elsewhere = np.einsum("mki,mi->mk", matches.gradient, matches.seen_at - cameras["cam2"].project(points))
+    first, second, light = (linearise(cameras, name, points, names) for name in (*CAMERAS, PROJECTOR))
+    shown, rows = light.pixels[:, axes], []
+    for by_first, by_second, by_light in (
+        (first.by_point, second.by_point, light.by_point[:, axes]),
+        (first.by_parameter, second.by_parameter, light.by_parameter[:, axes]),
+    ):  # a map is read at camera 2's predicted pixel, not at that of the point
+        rows.append(np.concatenate([by_first, by_light, by_light - matches.gradient @ by_second], axis=1))
+    elsewhere = np.einsum("mki,mi->mk", matches.gradient, matches.seen_at - second.pixels)
     missing = np.concatenate([np.zeros((m, 2)), matches.first - shown, matches.second - shown - elsewhere], axis=1)
     sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
     free = eliminate(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
