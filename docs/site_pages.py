@@ -16,7 +16,7 @@ from twin.experiments import result_rows
 from twin.experiments.result_rows import Row
 
 ROOT = Path(__file__).resolve().parent.parent
-HEADS = ("group", "id", "what", "measured", "bar", "limit", "unit", "met", "measured on", "commit")
+HEADS = ("group", "what", "measured", "bar", "limit", "unit", "met", "measured on", "commit")
 SCRIPT = """
 const rows = [...document.querySelectorAll("#rows tbody tr")];
 const [text, group, missed, count] = ["text", "group", "missed", "count"].map(id => document.getElementById(id));
@@ -52,7 +52,7 @@ def _html_row(row: Row) -> str:
     bar = "" if row.bar is None else f"{row.sense} {row.bar:.4g}"
     limit = "" if row.limit is None else f"{row.limit:.4g}"
     met = {None: "", True: "yes", False: "no"}[row.met]
-    cells = (row.group, row.id, row.what, f"{row.measured:.4g}", bar, limit, row.unit, met, row.day, row.commit)
+    cells = (row.group, row.what, f"{row.measured:.4g}", bar, limit, row.unit, met, row.day, row.commit)
     return f'<tr data-group="{row.group}" data-met="{met}">{"".join(f"<td>{html.escape(cell)}</td>" for cell in cells)}</tr>'
 
 

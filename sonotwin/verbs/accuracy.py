@@ -76,7 +76,7 @@ def run(config: Config) -> int:
         for row in bars.measure(asked[group], setup, kept, config.engine):
             verdict = {None: "    ", True: "ok  ", False: "MISS"}[row.met]
             bar = "" if row.bar is None else f" (bar {row.bar:.4g})"
-            console.print(f"{verdict} {row.id:3}{row.what}: {row.measured:.4g} {row.unit}{bar}", markup=False)
+            console.print(f"{verdict} {row.what}: {row.measured:.4g} {row.unit}{bar}", markup=False)
             measured.append(replace(row, day=day, commit=commit))
         result_rows.write_table(table, group, measured)
         if config.document:

@@ -21,7 +21,7 @@ def quick(monkeypatch):
     """The optics group with one row, whose figure the test chooses."""
 
     def measure(value: float) -> None:
-        figure = Figure(id="a", figure="error_mm", what="an error", most=0.05, unit="mm")
+        figure = Figure(figure="error_mm", what="an error", most=0.05, unit="mm")
         one = Experiment("optics", f"{__name__}.measured", "", {"value": value}, {}, None, (figure,))
         monkeypatch.setattr(bars, "read", lambda path: [one])
 
@@ -42,7 +42,7 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
     first, *rest = result_rows.read(page.with_suffix(".csv"))
     assert (first.measured, first.met, first.what) == (value, status == 0, "an error")
     assert str(rest) == str([row for row in others if row.group != "optics"])
-    assert (f"| an error | optics, row a | {value} mm | <= 0.05 |  |  | **no** |" in page.read_text()) == (status == 1)
+    assert (f"| an error | optics | {value} mm | <= 0.05 |  |  | **no** |" in page.read_text()) == (status == 1)
     assert ("MISS" in capsys.readouterr().out) == (status == 1)
 
 
@@ -53,7 +53,7 @@ def test_a_broken_file_of_rows_is_refused_first(quick, tmp_path, capsys):
     page.write_text("<!-- rows -->\n<!-- /rows -->\n")
     page.with_suffix(".csv").write_text("a,b\n1,2\n")
     assert main(["accuracy", "only=optics", f"out={tmp_path / 'out'}", f"document={page}"]) == 2
-    assert "page.csv: line 1: expected group,id,what" in capsys.readouterr().err
+    assert "page.csv: line 1: expected group,what" in capsys.readouterr().err
     assert page.with_suffix(".csv").read_text() == "a,b\n1,2\n" and not (tmp_path / "out").exists()
 
 

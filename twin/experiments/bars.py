@@ -31,7 +31,6 @@ Number = float | str | None  # a number, or a figure by its name, maybe as `1.25
 class Figure(Part):
     """A figure's row; texts may have `{name}` of settings, of `each`, of figures, and `{about}` of the entry."""
 
-    id: str
     figure: str
     what: str
     unit: str = ""
@@ -54,7 +53,7 @@ class Figure(Part):
             met = None if asked is None else bool(measured <= asked if sense == "<=" else measured >= asked)
             settings = json.dumps(experiment.settings, sort_keys=True)
             yield Row(
-                *(experiment.group, self.id, self.what.format(**known), measured, sense, asked, limit, self.unit, met),
+                *(experiment.group, self.what.format(**known), measured, sense, asked, limit, self.unit, met),
                 **{"experiment": experiment.of, "settings": settings, "figure": name},
             )
 

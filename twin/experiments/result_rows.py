@@ -22,7 +22,7 @@ from twin.experiments import document_tables
 
 MARK = "rows"  # of the short table's place in a document
 TABLE = "results.parquet"
-COLUMNS = 11  # of the CSV file: a row's first fields
+COLUMNS = 10  # of the CSV file: a row's first fields
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,6 @@ class Row:
     """One figure for people, with the state of the code that gave it."""
 
     group: str
-    id: str
     what: str
     measured: float
     sense: str  # <= or >=; empty without a bar
@@ -66,7 +65,7 @@ class Chosen:
 
     quantity: str
     conditions: str
-    rows: tuple[str, ...]  # patterns of `GROUP ID WHAT`, with * and ?
+    rows: tuple[str, ...]  # patterns of `GROUP WHAT`, with * and ?
 
 
 def file_of(document: Path) -> Path:
@@ -101,11 +100,11 @@ def read(path: Path) -> list[Row]:
 
 
 def _row_of(
-    group: str, id: str, what: str, measured: str, sense: str, bar: str, limit: str, unit: str, met: str, day: str, commit: str
+    group: str, what: str, measured: str, sense: str, bar: str, limit: str, unit: str, met: str, day: str, commit: str
 ) -> Row:
     asked, beside = (float(text) if text else None for text in (bar, limit))
     verdict = {"": None, "yes": True, "no": False}[met]
-    return Row(group, id, what, float(measured), sense, asked, beside, unit, verdict, day, commit)
+    return Row(group, what, float(measured), sense, asked, beside, unit, verdict, day, commit)
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
@@ -195,7 +194,7 @@ def read_choices(path: Path) -> list[Chosen]:
 
 def chosen_rows(rows: Sequence[Row], choice: Chosen) -> list[Row]:
     """Rows that fit a choice."""
-    return [row for row in rows if any(fnmatchcase(f"{row.group} {row.id} {row.what}", pattern) for pattern in choice.rows)]
+    return [row for row in rows if any(fnmatchcase(f"{row.group} {row.what}", pattern) for pattern in choice.rows)]
 
 
 def short_table(rows: Sequence[Row], choices: Sequence[Chosen]) -> str:
@@ -214,7 +213,7 @@ def short_table(rows: Sequence[Row], choices: Sequence[Chosen]) -> str:
 
 
 def _alone(row: Row) -> Chosen:
-    return Chosen(row.what, f"{row.group}, row {row.id}", ())
+    return Chosen(row.what, row.group, ())
 
 
 def _line(choice: Chosen, row: Row | None, count: int) -> str:
@@ -230,9 +229,9 @@ def _line(choice: Chosen, row: Row | None, count: int) -> str:
 
 def whole_table(rows: Sequence[Row], limit: str) -> str:
     """All rows as a Markdown table; `limit` heads the column of what they are compared with."""
-    lines = [f"| id | what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|---|"]
+    lines = [f"| what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|"]
     for row in rows:
         beside = "" if row.limit is None else f"{row.limit:.4g}"
         met = {None: "", True: "yes", False: "**no**"}[row.met]
-        lines.append(f"| {row.id} | {row.what} | {row.measured:.4g} | {row.asked} | {beside} | {row.unit} | {met} |")
+        lines.append(f"| {row.what} | {row.measured:.4g} | {row.asked} | {beside} | {row.unit} | {met} |")
     return "\n".join(lines)

@@ -31,9 +31,9 @@ ENTRIES = f"""
   over: {{length_mm: [1.0, 3.0]}}
   words: {{most: 5.0}}
   rows:
-    - {{id: a, figure: double_mm, what: "{{about}}: double", most: most, limit: limit_mm, unit: mm}}
-    - {{id: b, figure: double_mm, what: "{{about}}, {{name}}: double", least: "1.5 {{of}}", each: {{name: [x], of: [limit_mm]}}}}
-    - {{id: c, figure: odd_mm, what: "{{about}}: odd", optional: true}}
+    - {{figure: double_mm, what: "{{about}}: double", most: most, limit: limit_mm, unit: mm}}
+    - {{figure: double_mm, what: "{{about}}, {{name}}: double", least: "1.5 {{of}}", each: {{name: [x], of: [limit_mm]}}}}
+    - {{figure: odd_mm, what: "{{about}}: odd", optional: true}}
 - {{of: {__name__}.missing, needs: real, rows: []}}
 """
 
@@ -48,12 +48,12 @@ def group(tmp_path) -> list[bars.Experiment]:
 def test_rows_have_words_bars_and_limits(group, rig):
     """Bars in both directions, by numbers and by figures; a figure that isn't there is left out where that is allowed."""
     rows = list(bars.measure(group, Setup(rig), None, Engine()))
-    assert [(row.id, row.what, row.measured, row.sense, row.bar, row.limit, row.met) for row in rows] == [
-        ("a", "1 mm: double", 2.0, "<=", 5.0, 1.0, True),
-        ("b", "1 mm, x: double", 2.0, ">=", 1.5, None, True),
-        ("a", "3 mm: double", 6.0, "<=", 5.0, 3.0, False),
-        ("b", "3 mm, x: double", 6.0, ">=", 4.5, None, True),
-        ("c", "3 mm: odd", 1.0, "", None, None, None),
+    assert [(row.what, row.measured, row.sense, row.bar, row.limit, row.met) for row in rows] == [
+        ("1 mm: double", 2.0, "<=", 5.0, 1.0, True),
+        ("1 mm, x: double", 2.0, ">=", 1.5, None, True),
+        ("3 mm: double", 6.0, "<=", 5.0, 3.0, False),
+        ("3 mm, x: double", 6.0, ">=", 4.5, None, True),
+        ("3 mm: odd", 1.0, "", None, None, None),
     ]
     assert (rows[0].group, rows[0].figure, rows[0].settings) == ("group", "double_mm", '{"length_mm": 1.0}')
 
@@ -84,7 +84,7 @@ def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monk
 
 @pytest.mark.parametrize(
     ("entry", "complaint"),
-    [("{of: a.b, row: []}", "entry 1: rows: "), ("{of: a.b, rows: [{id: a}]}", r"entry 1: rows.0.figure: ")],
+    [("{of: a.b, row: []}", "entry 1: rows: "), ("{of: a.b, rows: [{what: a}]}", r"entry 1: rows.0.figure: ")],
 )
 def test_a_broken_file_is_refused(entry, complaint, tmp_path):
     (tmp_path / "group.yaml").write_text(f"- {entry}\n")
@@ -116,7 +116,7 @@ class Unknown(float):
 def test_the_documents_rows_are_those_of_the_bars():
     """Each row of docs/accuracy.csv is one of conf/bars, with its words, unit, bar and limit: none is put in by hand."""
     patterns = [
-        (path.stem, figure.id, re.compile(re.escape(text).replace("\0", NUMBER)), figure)
+        (path.stem, re.compile(re.escape(text).replace("\0", NUMBER)), figure)
         for path in FILES
         if path.parent.name == "accuracy"
         for one in experiments(path)
@@ -124,7 +124,7 @@ def test_the_documents_rows_are_those_of_the_bars():
         for text in texts(one, figure)
     ]
     for row in result_rows.read(CONF.parent / "docs" / "accuracy.csv"):
-        fit = [f for group, id, text, f in patterns if (group, id) == (row.group, row.id) and text.fullmatch(row.what)]
+        fit = [f for group, text, f in patterns if group == row.group and text.fullmatch(row.what)]
         fit = [f for f in fit if ("" if f.most is f.least is None else "<=" if f.least is None else ">=") == row.sense]
         assert len(fit) == 1 or BEFORE in row.what, row
         for figure in fit:
