@@ -112,12 +112,29 @@ def meanings(figures: Sequence[Figure]) -> list[str]:
 
 
 def markdown(compared: Sequence[Compared]) -> str:
-    """The table as Markdown, without the columns of limit and prediction where no figure has one."""
+    """The table as Markdown, without the columns of limit and prediction where no figure has one.
+
+    Of more than two points the means alone, a row a figure and method and a column a point.
+    """
+    points = list(dict.fromkeys(one.point for one in compared))
+    if len(points) > 2:
+        return _means(compared, points)
     without = set() if any(one.figure.limit for one in compared) else {"limit of noise"}
     without |= set() if any(one.figure.predicted for one in compared) else {"predicted for ours"}
     rows = [HEAD, *(cells(one) for one in compared)]
     head, *lines = [[cell for name, cell in zip(HEAD, row, strict=True) if name not in without] for row in rows]
     return "\n".join([f"| {' | '.join(head)} |", f"|{'---|' * len(head)}", *(f"| {' | '.join(line)} |" for line in lines)])
+
+
+def _means(compared: Sequence[Compared], points: Sequence[str]) -> str:
+    lines = [["figure", "by", "paper reported", *points, "unit"]]
+    lines.append(["---"] * len(lines[0]))
+    for figure in dict.fromkeys(one.figure for one in compared):
+        at = {one.point: one for one in compared if one.figure == figure}
+        means = {by: [shown(_middle(getattr(at[point], by)), ".3f") for point in points] for by in ("paper", "ours")}
+        lines.append([figure.what, "paper's method", _reported(figure), *means["paper"], figure.unit])
+        lines.append([figure.what, "ours", "", *means["ours"], figure.unit])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _reported(figure: Figure) -> str:

@@ -102,6 +102,19 @@ def test_a_table_in_markdown_has_a_row_a_figure_and_point():
     assert "limit" not in alone[0] and "predicted" not in alone[0] and {row.count("|") for row in alone} == {8}
 
 
+def test_of_many_points_the_table_has_a_column_each():
+    """With the means; a method without a figure there is unknown."""
+    more = [*DONE, trial("lifelike.board", 0, 0.4, 0.02), trial("lifelike.board", 1, 0.2, 0.01)]
+    lines = beside_paper.markdown(beside_paper.compare([PLANES, RADIUS], more)).splitlines()
+    assert [[cell.strip() for cell in line[1:-1].split("|")] for line in lines if "---" not in line] == [
+        ["figure", "by", "paper reported", "ideal", "lifelike", "lifelike.board", "unit"],
+        ["planes, RMS", "paper's method", "0.1 to 0.13", "0.120", "0.250", "0.300", "mm"],
+        ["planes, RMS", "ours", "", "0.040", "0.055", "0.015", "mm"],
+        ["radius error", "paper's method", "0.045", "unknown", "unknown", "unknown", "mm"],
+        ["radius error", "ours", "", "0.020", "0.030", "0.010", "mm"],
+    ]
+
+
 @pytest.mark.parametrize(
     ("sizes", "explained"),
     [
