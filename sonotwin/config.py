@@ -225,8 +225,9 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
             """The choices without any field that is given: what may stand there."""
             return OmegaConf.to_container(_composed(name, chosen)) if name else {}
 
+        given = {key: value for key, _, value in (override.partition("=") for override in quoted)}
         try:
-            composed = _composed(name, [part for override in quoted for part in _fitted(override, model, known)])
+            composed = _composed(name, [part for override in quoted for part in _fitted(override, model, known, given)])
             for override in plain:
                 field, _, value = override.partition("=")
                 OmegaConf.update(composed, field, _plain_value(verb, field, value))
@@ -433,8 +434,11 @@ def describe(error: ValidationError, model: type[BaseModel]) -> str:
     return text + (f" (and {len(others)} more)" if others else "")
 
 
-def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], Any]) -> list[str]:
-    """An override as Hydra takes it: maps of free names take new ones, and a thing of another kind replaces the old one."""
+def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], Any], others: Mapping[str, str]) -> list[str]:
+    """An override as Hydra takes it: maps of free names take new ones, and a thing of another kind replaces the old one.
+
+    So do fields that a thing has by its kind, which one of the other overrides may name.
+    """
     key, _, value = override.partition("=")
     if model is None or not re.fullmatch(r"\w[\w.]*", key):
         return [override]
@@ -442,11 +446,23 @@ def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], An
     types = _place(model, parts)[1]
     if _free(_place(model, parts[:-1])[1]) or (value[:1] == "{" and _free(types)):
         return [f"++{override}"]
+    if _is_of_kind(parts, model, known, others):
+        return [f"++{override}"]
     kinds = {name: tags for one in types if _is_model(one) for name, tags in _tags(one).items()}
     given = re.match(rf"\{{.*?\b({'|'.join(kinds)})\s*:\s*([\w-]+)", value) if kinds else None
     if given is None or _below(known(), [*parts, given[1]]) == given[2]:
         return [override]
     return [f"++{key}=null", f"++{override}"]
+
+
+def _is_of_kind(parts: Sequence[str], model: type[BaseModel], known: Callable[[], Any], given: Mapping[str, str]) -> bool:
+    """Whether a field is one that a thing has by the kind that is given for it."""
+    *above, field = parts
+    for one in filter(_is_model, _place(model, above)[1]):
+        for tag, values in _tags(one).items():
+            if field in one.model_fields and given.get(".".join([*above, tag])) in values:
+                return _below(known(), above) is not None
+    return False
 
 
 def _below(tree: Any, way: Sequence[str]) -> Any:
