@@ -424,6 +424,8 @@ import numpy as np
 from recon.capture import camera_dialects
 from recon.capture.camera_dialects import MM, Stored
 
+TOLD_BY = "rows of devices"
+
 
 def recognises(content):
     """Whether the first words are those of the dialect."""
