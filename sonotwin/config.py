@@ -9,7 +9,7 @@ import ast
 import inspect
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from functools import cache, lru_cache
@@ -249,7 +249,10 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
             inner = re.search(r"Key '([^']+)' is not in struct", str(error.__cause__))
             within = inner is not None and isinstance(_below(known(), unknown[1].split(".")), Mapping)
             key = f"{unknown[1]}.{inner[1]}" if inner is not None and within else unknown[1]
-            raise InputError(f"{verb}: {key}: {_unknown_key(key, known())}") from error
+            tree, above = known(), key.split(".")[:-1]
+            if model is not None and isinstance(there := _below(tree, above), dict):
+                there |= dict.fromkeys(_of_kind(above, model, given))
+            raise InputError(f"{verb}: {key}: {_unknown_key(key, tree)}") from error
         except MissingMandatoryValue as error:
             raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
         except OmegaConfBaseException as error:
@@ -446,23 +449,30 @@ def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], An
     types = _place(model, parts)[1]
     if _free(_place(model, parts[:-1])[1]) or (value[:1] == "{" and _free(types)):
         return [f"++{override}"]
-    if _is_of_kind(parts, model, known, others):
+    if parts[-1] in _of_kind(parts[:-1], model, others) and _below(known(), parts[:-1]) is not None:
         return [f"++{override}"]
     kinds = {name: tags for one in types if _is_model(one) for name, tags in _tags(one).items()}
-    given = re.match(rf"\{{.*?\b({'|'.join(kinds)})\s*:\s*([\w-]+)", value) if kinds else None
-    if given is None or _below(known(), [*parts, given[1]]) == given[2]:
+    given = _tag_in(value, kinds)
+    if given is None or _below(known(), [*parts, given[0]]) == given[1]:
         return [override]
     return [f"++{key}=null", f"++{override}"]
 
 
-def _is_of_kind(parts: Sequence[str], model: type[BaseModel], known: Callable[[], Any], given: Mapping[str, str]) -> bool:
-    """Whether a field is one that a thing has by the kind that is given for it."""
-    *above, field = parts
-    for one in filter(_is_model, _place(model, above)[1]):
+def _tag_in(value: str, tags: Collection[str]) -> tuple[str, str] | None:
+    """The field that tells a thing's kind, with its value, in a map on the command line."""
+    found = re.match(rf"\{{.*?\b({'|'.join(tags)})\s*:\s*([\w-]+)", value) if tags else None
+    return None if found is None else (found[1], found[2])
+
+
+def _of_kind(place: Sequence[str], model: type[BaseModel], given: Mapping[str, str]) -> list[str]:
+    """Fields that a thing has by its kind, if that is given for it by its tag or in a map; none if it isn't."""
+    key = ".".join(place)
+    for one in filter(_is_model, _place(model, place)[1]):
         for tag, values in _tags(one).items():
-            if field in one.model_fields and given.get(".".join([*above, tag])) in values:
-                return _below(known(), above) is not None
-    return False
+            named = _tag_in(given.get(key, ""), [tag])
+            if given.get(f"{key}.{tag}", named[1] if named else "").strip("'\"") in values:
+                return list(one.model_fields)
+    return []
 
 
 def _below(tree: Any, way: Sequence[str]) -> Any:

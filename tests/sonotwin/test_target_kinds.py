@@ -89,12 +89,14 @@ def test_a_kinds_fields_are_given_as_any_others(four):
     """With the kind, before it or after it; without it they are none."""
     fields = ["part=target", "out=t.pdf", "rig.target.c3_mm=33", "rig.target.c3_aside_mm=22"]
     kind = "rig.target.kind=four_circles"
-    for overrides in ([kind, *fields], [*fields, kind]):
+    usual = ("c1_mm", "c2_mm", "outer_diameter_mm", "inner_diameter_mm", "board_mm")
+    whole = ", ".join(f"{name}: {list(x) if isinstance(x := getattr(four.target, name), tuple) else x}" for name in usual)
+    for overrides in ([kind, *fields], [*fields, kind], [f"rig.target={{kind: four_circles, {whole}}}", *fields]):
         assert config.load("print", overrides, Config).rig.target == four.target
     with pytest.raises(InputError, match=r"rig\.target\.c3_mm: unknown key"):
         config.load("print", fields, Config)
-    with pytest.raises(InputError, match=r"rig\.target\.c4_mm: unknown key"):
-        config.load("print", [kind, "rig.target.c4_mm=33"], Config)
+    with pytest.raises(InputError, match=r"rig\.target\.c3_asid_mm: unknown key.*did you mean rig\.target\.c3_aside_mm"):
+        config.load("print", [kind, "rig.target.c3_asid_mm=33"], Config)
 
 
 @pytest.mark.parametrize(
