@@ -47,8 +47,8 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     for dialect in known.values():
         return dialect.read(content, sizes or {})
     found = short(", ".join(content.checked_values())) or "no keys"
-    expected = ", or ".join(dialect.TOLD_BY for dialect in registry.kinds(DIALECTS).values())
-    raise InputError(f"{path}: expected {expected}, found {found}")
+    told = [getattr(dialect, "TOLD_BY", f"a file of {name}") for name, dialect in registry.kinds(DIALECTS).items()]
+    raise InputError(f"{path}: expected {', or '.join(told)}, found {found}")
 
 
 def written() -> list[str]:
