@@ -9,7 +9,7 @@ import ast
 import inspect
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from copy import deepcopy
 from functools import cache, lru_cache
@@ -225,8 +225,9 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
             """The choices without any field that is given: what may stand there."""
             return OmegaConf.to_container(_composed(name, chosen)) if name else {}
 
+        given = {key: value for key, _, value in (override.partition("=") for override in quoted)}
         try:
-            composed = _composed(name, [part for override in quoted for part in _fitted(override, model, known)])
+            composed = _composed(name, [part for override in quoted for part in _fitted(override, model, known, given)])
             for override in plain:
                 field, _, value = override.partition("=")
                 OmegaConf.update(composed, field, _plain_value(verb, field, value))
@@ -248,7 +249,10 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
             inner = re.search(r"Key '([^']+)' is not in struct", str(error.__cause__))
             within = inner is not None and isinstance(_below(known(), unknown[1].split(".")), Mapping)
             key = f"{unknown[1]}.{inner[1]}" if inner is not None and within else unknown[1]
-            raise InputError(f"{verb}: {key}: {_unknown_key(key, known())}") from error
+            tree, above = known(), key.split(".")[:-1]
+            if model is not None and isinstance(there := _below(tree, above), dict):
+                there |= dict.fromkeys(_of_kind(above, model, given))
+            raise InputError(f"{verb}: {key}: {_unknown_key(key, tree)}") from error
         except MissingMandatoryValue as error:
             raise InputError(f"{verb}: {error.full_key}: needs a value; give {error.full_key}=...") from error
         except OmegaConfBaseException as error:
@@ -433,8 +437,11 @@ def describe(error: ValidationError, model: type[BaseModel]) -> str:
     return text + (f" (and {len(others)} more)" if others else "")
 
 
-def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], Any]) -> list[str]:
-    """An override as Hydra takes it: maps of free names take new ones, and a thing of another kind replaces the old one."""
+def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], Any], others: Mapping[str, str]) -> list[str]:
+    """An override as Hydra takes it: maps of free names take new ones, and a thing of another kind replaces the old one.
+
+    So do fields that a thing has by its kind, which one of the other overrides may name.
+    """
     key, _, value = override.partition("=")
     if model is None or not re.fullmatch(r"\w[\w.]*", key):
         return [override]
@@ -442,11 +449,30 @@ def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], An
     types = _place(model, parts)[1]
     if _free(_place(model, parts[:-1])[1]) or (value[:1] == "{" and _free(types)):
         return [f"++{override}"]
+    if parts[-1] in _of_kind(parts[:-1], model, others) and _below(known(), parts[:-1]) is not None:
+        return [f"++{override}"]
     kinds = {name: tags for one in types if _is_model(one) for name, tags in _tags(one).items()}
-    given = re.match(rf"\{{.*?\b({'|'.join(kinds)})\s*:\s*([\w-]+)", value) if kinds else None
-    if given is None or _below(known(), [*parts, given[1]]) == given[2]:
+    given = _tag_in(value, kinds)
+    if given is None or _below(known(), [*parts, given[0]]) == given[1]:
         return [override]
     return [f"++{key}=null", f"++{override}"]
+
+
+def _tag_in(value: str, tags: Collection[str]) -> tuple[str, str] | None:
+    """The field that tells a thing's kind, with its value, in a map on the command line."""
+    found = re.match(rf"\{{.*?\b({'|'.join(tags)})\s*:\s*([\w-]+)", value) if tags else None
+    return None if found is None else (found[1], found[2])
+
+
+def _of_kind(place: Sequence[str], model: type[BaseModel], given: Mapping[str, str]) -> list[str]:
+    """Fields that a thing has by its kind, if that is given for it by its tag or in a map; none if it isn't."""
+    key = ".".join(place)
+    for one in filter(_is_model, _place(model, place)[1]):
+        for tag, values in _tags(one).items():
+            named = _tag_in(given.get(key, ""), [tag])
+            if given.get(f"{key}.{tag}", named[1] if named else "").strip("'\"") in values:
+                return list(one.model_fields)
+    return []
 
 
 def _below(tree: Any, way: Sequence[str]) -> Any:

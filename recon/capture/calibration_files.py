@@ -25,7 +25,6 @@ from recon.model.lengths import UNIT_KEY
 log = logging.getLogger(__name__)
 
 DIALECTS = "recon.capture.calibration_dialects"  # a module each
-EXPECTED = "schema, or M1 and M4, or M1 and M2, or K1 and K2, or Kc and Kp, or a file of Kalibr, ROS or mrcal"
 
 
 def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
@@ -48,7 +47,8 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     for dialect in known.values():
         return dialect.read(content, sizes or {})
     found = short(", ".join(content.checked_values())) or "no keys"
-    raise InputError(f"{path}: expected {EXPECTED}, found {found}")
+    told = [getattr(dialect, "TOLD_BY", f"a file of {name}") for name, dialect in registry.kinds(DIALECTS).items()]
+    raise InputError(f"{path}: expected {', or '.join(told)}, found {found}")
 
 
 def written() -> list[str]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 from pydantic import Field, field_validator, model_serializer, model_validator
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import DISTORTION_LENGTHS, Camera
 from recon.model.lengths import TARGET_CIRCLE, TARGET_STEP
@@ -117,7 +118,7 @@ class Target(Kinds):
 
     PACKAGE = "recon.model.targets"
     USUAL = "three_circles"
-    LENGTHS: ClassVar[tuple[str, ...]]  # names of fields: c1, then c2 aside (along x) and c2 (along y), and so on
+    LENGTHS: ClassVar[tuple[str, ...]]  # names of fields: c1_mm, then c2_aside_mm (along x) and c2_mm (along y), and so on
 
     outer_diameter_mm: Positive
     inner_diameter_mm: Positive
@@ -127,6 +128,18 @@ class Target(Kinds):
     covariance_mm2: tuple[tuple[Finite, ...], ...] | None = None  # of the lengths as measured; instead of the tolerance
     unusual: bool = False  # lengths that no usual target has, such as circles of less than 2.5 mm, are meant
 
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Refuse a kind whose lengths aren't those of circles, one by one: their order tells which is which."""
+        found = tuple(cls.LENGTHS)
+        circles = max((len(found) + 4) // 2, 3)
+        expected = ("c1_mm", *(name for k in range(2, circles) for name in (f"c{k}_aside_mm", f"c{k}_mm")))
+        if found != expected:
+            ordered = f"{' '.join(expected)}, in this order"
+            raise InputError(f"expected LENGTHS in {cls.__module__} of {ordered}, found {' '.join(found)}")
+        if missing := [name for name in found if name not in cls.model_fields]:
+            raise InputError(f"expected a field in {cls.__module__} for each of its LENGTHS, found none for {' '.join(missing)}")
+
     @model_serializer(mode="plain")
     def _own_fields_first(self) -> dict[str, Any]:
         own = [name for name in type(self).model_fields if name not in Target.model_fields]
@@ -135,6 +148,9 @@ class Target(Kinds):
 
     @model_validator(mode="after")
     def _usual_lengths(self) -> Self:
+        for name in ("c1_mm", "c2_mm"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name}: expected more than 0, that c0, c1 and c2 span a plane, found {getattr(self, name):g}")
         sides = [name for name in self.LENGTHS if "aside" not in name]
         for name, usual in (*((side, TARGET_STEP) for side in sides), ("outer_diameter_mm", TARGET_CIRCLE)):
             fault = usual.fault(abs(getattr(self, name)))

@@ -1,12 +1,12 @@
 """Write a capture in another group's layout, for their programs.
 
-`layout=kalibr`, `ros`, `mrcal` and `slstudio` are for the calibration of cameras and projector alone, of a capture or as a file:
-Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's calibration.xml.
-`layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with target_pose.npy, and
-the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep with poses, as
-`sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold. B-scans without
-a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else ever is. Takes
-seconds.
+A program's name, such as `layout=kalibr`, `ros`, `mrcal` or `slstudio`, is for the calibration of cameras and projector alone,
+of a capture or as a file: Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's
+calibration.xml. `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with
+target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep
+with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold.
+B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else
+ever is. Takes seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
@@ -62,7 +62,8 @@ class Config(Part):
     """Fields of `sonotwin export`."""
 
     layout: Annotated[str, PlainValidator(known_layout)] = MEZA
-    """meza2021: the rig authors' data sets; kalibr, ros, mrcal, slstudio: the calibration of cameras and projector"""
+    """meza2021: the rig authors' data sets; a program's name, such as kalibr, ros, mrcal, slstudio: the calibration of
+    cameras and projector alone"""
     capture: Path | None = None
     """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it"""
     out: Path

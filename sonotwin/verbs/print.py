@@ -1,7 +1,7 @@
 """Draw a calibration board or the probe's target for a printer: a PDF of one page, true to scale.
 
-`part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the three rings
-of `rig.target`. Around the card to cut out are cut marks, a ruler of 100 mm along each axis, and its lengths in small print.
+`part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the rings of
+`rig.target`. Around the card to cut out are cut marks, a ruler of 100 mm along each axis, and its lengths in small print.
 Writes the file `out`; one that is there is replaced. Takes a second.
 
 Print at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper wherever board or

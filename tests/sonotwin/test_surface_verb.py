@@ -475,3 +475,6 @@ def test_another_dialect_of_calibrations_is_one_module(optics, tmp_path, monkeyp
         assert main(["surface", f"capture={capture}", f"out={tmp_path / name}", *given]) == 0
     with np.load(tmp_path / "a" / "points.npz") as own, np.load(tmp_path / "b" / "points.npz") as other:
         assert np.allclose(own["points"], other["points"], atol=1e-3, equal_nan=True)
+    theirs.write_text("%YAML:1.0\n---\nA: 1\n", encoding="utf-8")
+    assert main(["surface", f"capture={capture}", f"calibration={theirs}", f"out={tmp_path / 'c'}"]) == 2
+    assert "or a file of ROS, or a file of rows, or M1" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
+from recon import registry
 from recon.capture import target_files
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -16,7 +17,9 @@ from recon.model.rig import Rig
 from recon.tracking import networks
 from recon.tracking.pose import estimate
 from recon.tracking.pose_fit import Sighting
+from sonotwin import config
 from sonotwin.cli import main
+from sonotwin.verbs.print import Config
 from tests import added
 from tests.recon import captures
 from tests.recon.tracking import drawings, films
@@ -80,6 +83,49 @@ def sightings(rig, pose, rng, sigma_px):
         noisy = centres + sigma_px * rng.standard_normal(centres.shape)
         views.append(Sighting(camera, noisy, np.tile(sigma_px**2 * np.eye(2), (len(centres), 1, 1)), shapes))
     return views
+
+
+def test_a_kinds_fields_are_given_as_any_others(four):
+    """With the kind, before it or after it; without it they are none."""
+    fields = ["part=target", "out=t.pdf", "rig.target.c3_mm=33", "rig.target.c3_aside_mm=22"]
+    kind = "rig.target.kind=four_circles"
+    usual = ("c1_mm", "c2_mm", "outer_diameter_mm", "inner_diameter_mm", "board_mm")
+    whole = ", ".join(f"{name}: {list(x) if isinstance(x := getattr(four.target, name), tuple) else x}" for name in usual)
+    for overrides in ([kind, *fields], [*fields, kind], [f"rig.target={{kind: four_circles, {whole}}}", *fields]):
+        assert config.load("print", overrides, Config).rig.target == four.target
+    with pytest.raises(InputError, match=r"rig\.target\.c3_mm: unknown key"):
+        config.load("print", fields, Config)
+    with pytest.raises(InputError, match=r"rig\.target\.c3_asid_mm: unknown key.*did you mean rig\.target\.c3_aside_mm"):
+        config.load("print", [kind, "rig.target.c3_asid_mm=33"], Config)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "said"),
+    [
+        ('("c1_mm", "c2_mm", "c2_aside_mm", "c3_mm", "c3_aside_mm")', "of c1_mm c2_aside_mm c2_mm c3_aside_mm c3_mm, "),
+        ('("c1_mm", "c2_aside_mm", "c2_mm", "c3_aside_mm")', "of c1_mm c2_aside_mm c2_mm c3_aside_mm c3_mm, in this order"),
+        ('("c1_mm", "x2_mm", "y2_mm")', "of c1_mm c2_aside_mm c2_mm, in this order, found c1_mm x2_mm y2_mm"),
+        ('("c1_mm", "c2_aside_mm", "c2_mm", "c3_aside_mm", "c3_mm", "c4_aside_mm", "c4_mm")', "found none for c4_aside_mm c4_mm"),
+    ],
+)
+def test_a_kind_of_lengths_in_another_order_is_refused(lengths, said, rig, tmp_path, monkeypatch):
+    """It would be another target: with along and aside exchanged c2 lies on the x axis."""
+    source = FOUR.replace('("c1_mm", "c2_aside_mm", "c2_mm", "c3_aside_mm", "c3_mm")', lengths)
+    added.add(monkeypatch, tmp_path / "ours", "recon.model.targets", "four_circles", source)
+    with pytest.raises(InputError, match=f"in recon.model.targets.four_circles.*{said}"):
+        registry.kind("recon.model.targets", "four_circles")
+    with pytest.raises(ValueError, match=f"target\n.*in recon.model.targets.four_circles.*{said}"):
+        Rig.model_validate(rig.model_dump() | {"target": rig.target.model_dump() | C3})
+
+
+def test_circles_on_a_line_are_refused(rig, tmp_path, monkeypatch):
+    """Even of a kind that allows it, and of an unusual target: a plane through c0, c1 and c2 is divided by c2's distance."""
+    source = FOUR.replace("c2_mm: Positive", "c2_mm: Finite")
+    added.add(monkeypatch, tmp_path / "ours", "recon.model.targets", "four_circles", source)
+    for c2 in (0.0, -40.0):
+        target = rig.target.model_dump() | C3 | {"c2_mm": c2, "unusual": True}
+        with pytest.raises(ValueError, match="c2_mm: expected more than 0"):
+            Rig.model_validate(rig.model_dump() | {"target": target})
 
 
 def test_four_circles_place_the_target_better_than_three(rig, four, rng):

@@ -14,6 +14,8 @@ from recon.files import yaml_text
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 
+TOLD_BY = "a file of Kalibr"
+
 
 def recognises(content: Content) -> bool:
     """Whether a camera begins the text."""

@@ -14,6 +14,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Array
 from recon.model.calibration import WORLD, Calibration
 
+TOLD_BY = "a file of mrcal"
 MRCAL = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}  # coefficients by the model's name
 LISTED = re.compile(rf"\[\s*(?:{NUMBER}\s*(?:,\s*{NUMBER}\s*)*,?\s*)?\]")
 

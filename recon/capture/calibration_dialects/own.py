@@ -17,6 +17,7 @@ from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.model.calibration import WORLD, Calibration, Uncertainty
 from recon.model.lengths import UNIT_KEY
 
+TOLD_BY = "schema"
 SCHEMA = "sonotwin-optics/1"
 
 

@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import WORLD, Calibration
 
+TOLD_BY = "a file of ROS"
 ROS = {"plumb_bob": (4, 5), "rational_polynomial": (8,)}
 
 

@@ -11,6 +11,8 @@ from recon.errors import InputError
 from recon.geometry.camera import Array
 from recon.model.calibration import Calibration
 
+TOLD_BY = "M1 and M4"
+
 
 def recognises(content: Content) -> bool:
     """Whether the matrix of the projector is there, or that of the camera without one of a second."""

@@ -13,6 +13,7 @@ from recon.files import opencv_storage
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 
+TOLD_BY = "Kc and Kp"
 SLSTUDIO_SIZES = {"cam1": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
 
 

@@ -15,6 +15,7 @@ from recon.geometry.camera import Array
 from recon.model.calibration import Calibration
 from recon.model.lengths import UNIT_KEY
 
+TOLD_BY = "K1 and K2"
 OLD_KEYS = {"distCoeffs1": "dist1", "distCoeffs2": "dist2"}  # of the authors' first files
 
 

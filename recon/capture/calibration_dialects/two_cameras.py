@@ -10,6 +10,8 @@ from recon.errors import InputError, short
 from recon.files.opencv_storage import Values
 from recon.model.calibration import Calibration
 
+TOLD_BY = "M1 and M2"
+
 
 def recognises(content: Content) -> bool:
     """Whether the matrix of a second camera is there, and none of a projector."""

@@ -1,4 +1,4 @@
-"""Clips of a scanner's screen. Each module is a dialect, recognised by the name of the file or its kind.
+"""Clips of a scanner's screen. Each module is a dialect, recognised by its mark or its suffix, or as a folder.
 
 A module has
 

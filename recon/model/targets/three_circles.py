@@ -10,6 +10,6 @@ class Kind(Target):
 
     LENGTHS = ("c1_mm", "c2_aside_mm", "c2_mm")
     kind: Literal["three_circles"] = "three_circles"
-    c1_mm: Positive
+    c1_mm: Positive  # files have the fields in this order, which need not be that of LENGTHS
     c2_mm: Positive  # along y
     c2_aside_mm: Finite = 0.0  # along x

@@ -476,7 +476,8 @@ def without(values, key):
         (lambda v: v | {"M4": "text"}, "M4: expected a matrix, found something else"),
         (
             lambda v: {"A": np.eye(3)},
-            f"expected {calibration_files.EXPECTED}, found A",
+            "expected a file of Kalibr, or a file of mrcal, or schema, or a file of ROS, or M1 and M4, or Kc and Kp, "
+            "or K1 and K2, or M1 and M2, found A",
         ),
     ],
 )

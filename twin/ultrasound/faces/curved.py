@@ -37,5 +37,5 @@ class Face(Part):
 
     @property
     def foot_mm(self) -> float:
-        """Width of what touches the skin: the whole arc's."""
+        """Width of what touches the skin: the whole arc's, from end to end."""
         return self.chord_mm
