@@ -38,9 +38,9 @@ class Settings(render.Config):
     ultrasound: Transducer
     path: AnyPath | None
     clocks: Clocks = Clocks(camera_hz=16.0)
-    wires: Annotated[int, Field(ge=1, le=1000)] = 40
-    bottom_s: Positive = 5.0
-    board_samples: Samples | None = None  # rays a pixel of the board's images at most
+    wires: Annotated[int, Field(ge=1, le=1000)] = 30
+    bottom_s: Positive = 4.0
+    board_samples: Samples | None = 8  # rays a pixel of the board's images at most
 
     @model_validator(mode="after")
     def _fits_poses(self) -> "Settings":
