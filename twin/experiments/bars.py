@@ -130,8 +130,9 @@ def measure(experiments: Sequence[Experiment], setup: Setup, kept: Kept | None, 
 
 
 def _figures(key: str, one: Experiment, setup: Setup) -> tuple[str, Metrics]:
-    """Measure on any machine."""
-    return key, {name: float(value) for name, value in one.function(setup, **one.settings).items()}
+    """Measure on any machine that has the code of who asks; raises InputError as `same_code` does."""
+    with experiment_runs.same_code(key, one.key(setup)):
+        return key, {name: float(value) for name, value in one.function(setup, **one.settings).items()}
 
 
 def _number(given: Number, known: Figures) -> float | None:

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from recon.errors import InputError
+from recon.files.code_digest import code_digest
 from tests.twin.experiments.asked import CONF, FILES, experiments
 from twin.engine import Engine
-from twin.experiments import bars, result_rows
+from twin.experiments import bars, experiment_runs, result_rows
 from twin.experiments.experiment_setup import Setup
 from twin.experiments.kept_figures import Kept
 
@@ -80,6 +81,33 @@ def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monk
     for each in (setup, setup, Setup(other)):
         assert list(bars.measure(group, each, kept, Engine())) == first
     assert CALLS == {1.0: 2, 3.0: 2}
+
+
+def test_workers_of_other_code_refuse(group, rig, tmp_path):
+    """Their figures would be kept under the name of the asker's."""
+    kept = Kept(tmp_path / "kept")
+    kept.open()
+    with pytest.raises(
+        InputError, match="engine: expected workers with the code and the libraries of this machine, found others"
+    ):
+        list(kept.run(Engine(), bars._figures, {"of other code": (group[0], Setup(rig))}))
+    assert not CALLS and not list(kept.folder.iterdir())
+
+
+def test_code_that_is_edited_while_it_measures_is_refused(group, rig, tmp_path, monkeypatch):
+    """It is imported late, so nobody can say of which code the figures are; those kept before stay."""
+    (code := tmp_path / "code").mkdir()
+    monkeypatch.setattr(experiment_runs, "PACKAGES", (code,))
+    monkeypatch.setattr(bars, "OURS", __name__.partition(".")[0])
+    code_digest(code)
+    kept = Kept(tmp_path / "kept")
+    kept.open()
+    rows = bars.measure(group, Setup(rig), kept, Engine())
+    next(rows)
+    (code / "late.py").write_text("")
+    with pytest.raises(InputError, match=r"engine: expected .* found it edited meanwhile"):
+        list(rows)
+    assert len(list(kept.folder.iterdir())) == 1 and CALLS == {1.0: 1, 3.0: 1}
 
 
 @pytest.mark.parametrize(
