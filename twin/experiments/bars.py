@@ -7,7 +7,7 @@ accuracy, and one of speed, is a list of such entries in `conf/bars/`.
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from recon.model.part import Part
 from twin.engine import Engine
 from twin.experiments import experiment_runs, virtual_screen
 from twin.experiments.experiment_setup import Figures, Setup, digest_of
-from twin.experiments.kept_figures import Kept
+from twin.experiments.kept_figures import UNKNOWN, Kept
 from twin.experiments.result_rows import Row
 
 OURS = "twin"  # package whose experiments depend on code and settings alone
@@ -67,6 +67,8 @@ class Entry(Part):
     settings: dict[str, Any] = Field(default_factory=dict)
     words: dict[str, Any] = Field(default_factory=dict)  # that texts and bars may use, too
     needs: Literal["real", "screen", None] = None  # recordings, or a virtual screen; left out without
+    kept: bool = True  # false for figures of a machine and a moment, times above all: measured in each run, here and alone
+    draws: tuple[str, ...] = ()  # pictures in the folder of results, without which it is measured again
     rows: tuple[Figure, ...]
 
 
@@ -81,6 +83,8 @@ class Experiment:
     words: Mapping[str, Any]
     needs: str | None
     figures: tuple[Figure, ...]
+    kept: bool = True
+    draws: tuple[str, ...] = ()
 
     @property
     def function(self) -> Callable[..., Figures]:
@@ -91,6 +95,14 @@ class Experiment:
     def at_hand(self, setup: Setup) -> bool:
         """Whether what it needs is there."""
         return {None: True, "real": setup.real is not None, "screen": bool(virtual_screen.installed())}[self.needs]
+
+    def keeps(self) -> bool:
+        """Whether its figures depend on code, settings and inputs alone; commands' own experiments keep their parts."""
+        return self.kept and self.of.startswith(f"{OURS}.")
+
+    def has_drawn(self, setup: Setup) -> bool:
+        """Whether all pictures are there that it draws."""
+        return setup.out is None or all((setup.out / name).is_file() for name in self.draws)
 
     def rows(self, figures: Figures) -> list[Row]:
         """Rows of figures that were measured."""
@@ -106,7 +118,8 @@ def read(path: Path) -> list[Experiment]:
     entries = [validated(Entry, entry, f"{path}: entry {k + 1}") for k, entry in enumerate(yaml_text.read(path))]
     return [
         Experiment(
-            path.stem, one.of, one.about, one.settings | dict(zip(one.over, values, strict=True)), one.words, one.needs, one.rows
+            *(path.stem, one.of, one.about, one.settings | dict(zip(one.over, values, strict=True)), one.words, one.needs),
+            *(one.rows, one.kept, one.draws),
         )
         for one in entries
         for values in itertools.product(*one.over.values())
@@ -116,17 +129,25 @@ def read(path: Path) -> list[Experiment]:
 def measure(experiments: Sequence[Experiment], setup: Setup, kept: Kept | None, engine: Engine) -> Iterator[Row]:
     """Measure what can be measured, and give the rows in the order of the file as soon as they are there.
 
-    kept : for experiments of the twin, whose figures depend on code and settings alone; the command's own keep their parts
+    kept : for experiments that keep their figures; its state is that of the rows, of kept ones the state that they were kept with
     """
     there = [one for one in experiments if one.at_hand(setup)]
-    keys = {id(one): one.key(setup) for one in there if one.of.startswith(f"{OURS}.")} if kept else {}
+    keys = {id(one): one.key(setup) for one in there if one.keeps()} if kept else {}
     tasks = {keys[id(one)]: (one, setup) for one in there if id(one) in keys}
+    for key, (one, _) in tasks.items():
+        if kept and not one.has_drawn(setup):
+            kept.forget(key)
     running, done = kept.run(engine, _figures, tasks) if kept else iter(()), dict[str, Any]()
     for one in there:
-        key = keys.get(id(one), "")
-        while key in tasks and key not in done:
-            done |= [next(running)]
-        yield from one.rows(done[key] if key in tasks else one.function(setup, **one.settings))
+        key, state = keys.get(id(one)), kept.state if kept else UNKNOWN
+        if kept and key:
+            while key not in done:
+                done |= [next(running)]
+            found, state = done[key], kept.state_of(key)
+        else:
+            done |= running  # to the end, so that no worker takes a part of this machine's time
+            found = one.function(setup, **one.settings)
+        yield from (replace(row, day=state.day, commit=state.commit) for row in one.rows(found))
 
 
 def _figures(key: str, one: Experiment, setup: Setup) -> tuple[str, Metrics]:

@@ -3,6 +3,7 @@
 import inspect
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from tests.twin.experiments.asked import CONF, FILES, experiments
 from twin.engine import Engine
 from twin.experiments import bars, experiment_runs, result_rows
 from twin.experiments.experiment_setup import Setup
-from twin.experiments.kept_figures import Kept
+from twin.experiments.kept_figures import Kept, State
 
 NUMBER = r"([-+.\de]+|nan|inf)"
 BEFORE = "bracket that gives over the wires, over switching"  # a row of before the bracket in the scan was counted, too
@@ -81,6 +82,34 @@ def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monk
     for each in (setup, setup, Setup(other)):
         assert list(bars.measure(group, each, kept, Engine())) == first
     assert CALLS == {1.0: 2, 3.0: 2}
+
+
+def test_what_depends_on_the_moment_is_measured_each_time(group, rig, tmp_path, monkeypatch):
+    """Here, alone: after all tasks that were begun; and its rows have the day of this run, kept ones the day they were kept."""
+    monkeypatch.setattr(bars, "OURS", __name__.partition(".")[0])
+    first, second = (one for one in group if one.needs is None)
+    mixed, setup = [replace(first, kept=False), second], Setup(rig)
+    for day in ("2026-01-01", "2026-01-02"):
+        kept = Kept(tmp_path / "kept", State(day, "abc"))
+        kept.open()
+        rows = bars.measure(mixed, setup, kept, Engine())
+        assert (next(rows).day, CALLS[3.0]) == (day, 1)
+        assert {(row.day, row.commit) for row in rows if row.what.startswith("3 mm")} == {("2026-01-01", "abc")}
+    assert CALLS == {1.0: 2, 3.0: 1}
+
+
+def test_a_picture_that_is_missing_is_drawn_again(group, rig, tmp_path, monkeypatch):
+    """With its figures, though they were kept."""
+    monkeypatch.setattr(bars, "OURS", __name__.partition(".")[0])
+    kept, one, out = Kept(tmp_path / "kept"), replace(group[0], draws=("doubled.png",)), tmp_path / "out"
+    kept.open()
+    out.mkdir()
+    for place, calls in ((None, 1), (None, 1), (out, 2), (out, 3)):
+        list(bars.measure([one], Setup(rig, out=place), kept, Engine()))
+        assert CALLS[1.0] == calls
+    (out / "doubled.png").touch()
+    list(bars.measure([one], Setup(rig, out=out), kept, Engine()))
+    assert CALLS[1.0] == 3
 
 
 def test_workers_of_other_code_refuse(group, rig, tmp_path):
