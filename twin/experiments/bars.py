@@ -12,9 +12,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from recon.errors import validated
+from recon.errors import InputError, validated
 from recon.files import yaml_text
 from recon.files.metrics import Metrics
 from recon.model.part import Part
@@ -39,6 +39,18 @@ class Figure(Part):
     limit: Number = None
     each: dict[str, tuple[Any, ...]] = Field(default_factory=dict)  # values that the row is repeated for, in step
     optional: bool = False  # left out where the experiment has no such figure
+
+    @model_validator(mode="after")
+    def _one_bar_and_equal_lists(self) -> "Figure":
+        if self.most is not None and self.least is not None:
+            raise ValueError(
+                f"expected one bar, most or least, found most: {self.most} and least: {self.least}; give each its row"
+            )
+        if len({len(values) for values in self.each.values()}) > 1:
+            raise ValueError(
+                f"each: expected lists of one length, found {', '.join(f'{len(v)} {k}' for k, v in self.each.items())}"
+            )
+        return self
 
     def rows(self, experiment: "Experiment", figures: Figures) -> Iterator[Row]:
         """The rows of measured figures."""
@@ -85,6 +97,7 @@ class Experiment:
     figures: tuple[Figure, ...]
     kept: bool = True
     draws: tuple[str, ...] = ()
+    place: str = ""  # file and number of its entry
 
     @property
     def function(self) -> Callable[..., Figures]:
@@ -105,8 +118,15 @@ class Experiment:
         return setup.out is None or all((setup.out / name).is_file() for name in self.draws)
 
     def rows(self, figures: Figures) -> list[Row]:
-        """Rows of figures that were measured."""
-        return [row for one in self.figures for row in one.rows(self, figures)]
+        """Rows of figures that were measured; raises InputError if a row's text or bar has a name that there is none of."""
+        rows = []
+        for one in self.figures:
+            try:
+                rows += one.rows(self, figures)
+            except (KeyError, IndexError, ValueError) as error:
+                expected = f"expected names of its settings, words and figures, which are {', '.join(figures)}"
+                raise InputError(f"{self.place}: {one.figure}: {expected}; found {error}") from error
+        return rows
 
     def key(self, setup: Setup) -> str:
         """Digest of all that its figures depend on."""
@@ -115,13 +135,14 @@ class Experiment:
 
 def read(path: Path) -> list[Experiment]:
     """Read a group, `conf/bars/accuracy/GROUP.yaml`; raises InputError with the field that is wrong."""
-    entries = [validated(Entry, entry, f"{path}: entry {k + 1}") for k, entry in enumerate(yaml_text.read(path))]
+    places = {f"{path}: entry {k + 1}": entry for k, entry in enumerate(yaml_text.read(path))}
+    entries = {place: validated(Entry, entry, place) for place, entry in places.items()}
     return [
         Experiment(
             *(path.stem, one.of, one.about, one.settings | dict(zip(one.over, values, strict=True)), one.words, one.needs),
-            *(one.rows, one.kept, one.draws),
+            *(one.rows, one.kept, one.draws, place),
         )
-        for one in entries
+        for place, one in entries.items()
         for values in itertools.product(*one.over.values())
     ]
 

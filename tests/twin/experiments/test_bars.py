@@ -66,8 +66,9 @@ def test_no_number_meets_no_bar(group):
 
 
 def test_a_figure_that_is_missing_is_an_error(group):
-    with pytest.raises(KeyError, match="limit_mm"):
-        group[0].rows({})
+    """One line with file, entry and row, however many hours after the start."""
+    with pytest.raises(InputError, match=r"group.yaml: entry 1: double_mm: .* which are double_mm; found 'limit_mm'"):
+        group[0].rows({"double_mm": 1.0})
 
 
 def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monkeypatch):
@@ -141,7 +142,18 @@ def test_code_that_is_edited_while_it_measures_is_refused(group, rig, tmp_path, 
 
 @pytest.mark.parametrize(
     ("entry", "complaint"),
-    [("{of: a.b, row: []}", "entry 1: rows: "), ("{of: a.b, rows: [{what: a}]}", r"entry 1: rows.0.figure: ")],
+    [
+        ("{of: a.b, row: []}", "entry 1: rows: "),
+        ("{of: a.b, rows: [{what: a}]}", "entry 1: rows.0.figure: "),
+        (
+            "{of: a.b, rows: [{figure: a, what: a, most: 1, least: 0}]}",
+            "entry 1: rows.0: expected one bar, most or least, found most",
+        ),
+        (
+            "{of: a.b, rows: [{figure: a, what: a, each: {b: [1], c: [1, 2]}}]}",
+            "entry 1: rows.0.each: expected lists of one length, found 1 b, 2 c",
+        ),
+    ],
 )
 def test_a_broken_file_is_refused(entry, complaint, tmp_path):
     (tmp_path / "group.yaml").write_text(f"- {entry}\n")
