@@ -8,6 +8,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,18 @@ from twin.experiments.result_rows import Row
 
 OURS = "twin"  # package whose experiments depend on code and settings alone
 Number = float | str | None  # a number, or a figure by its name, maybe as `1.25 limit_mm` or `limit_mm / 1.5`
+
+
+class Known(dict[str, Any]):
+    """Settings, words and figures by name, for texts and bars; it notes which were used."""
+
+    def __init__(self, known: Mapping[str, Any], used: set[str]) -> None:
+        super().__init__(known)
+        self.used = used
+
+    def __getitem__(self, name: str) -> Any:
+        self.used.add(name)
+        return super().__getitem__(name)
 
 
 class Figure(Part):
@@ -52,20 +65,22 @@ class Figure(Part):
             )
         return self
 
-    def rows(self, experiment: "Experiment", figures: Figures) -> Iterator[Row]:
-        """The rows of measured figures."""
+    def rows(self, experiment: "Experiment", figures: Figures, used: set[str]) -> Iterator[Row]:
+        """The rows of measured figures; notes the names that they use."""
         for values in zip(*self.each.values(), strict=True) if self.each else [()]:
-            known = {**figures, **experiment.settings, **experiment.words, **dict(zip(self.each, values, strict=True))}
-            known["about"] = experiment.about.format(**known)
-            name = self.figure.format(**known)
+            given = {**figures, **experiment.settings, **experiment.words, **dict(zip(self.each, values, strict=True))}
+            known = Known(given, used)
+            known["about"] = experiment.about.format_map(known)
+            name = self.figure.format_map(known)
+            used.add(name)
             if self.optional and name not in figures:
                 continue
-            asked, limit = (_number(given, known) for given in (self.most if self.least is None else self.least, self.limit))
+            asked, limit = (_number(number, known) for number in (self.most if self.least is None else self.least, self.limit))
             sense, measured = "" if asked is None else "<=" if self.least is None else ">=", float(figures[name])
             met = None if asked is None else bool(measured <= asked if sense == "<=" else measured >= asked)
             settings = json.dumps(experiment.settings, sort_keys=True)
             yield Row(
-                *(experiment.group, self.what.format(**known), measured, sense, asked, limit, self.unit, met),
+                *(experiment.group, self.what.format_map(known), measured, sense, asked, limit, self.unit, met),
                 **{"experiment": experiment.of, "settings": settings, "figure": name},
             )
 
@@ -81,6 +96,7 @@ class Entry(Part):
     needs: Literal["real", "screen", None] = None  # recordings, or a virtual screen; left out without
     kept: bool = True  # false for figures of a machine and a moment, times above all: measured in each run, here and alone
     draws: tuple[str, ...] = ()  # pictures in the folder of results, without which it is measured again
+    every: str = ""  # pattern of figures that are as many as something else has parts: each must be in a row, a text or a bar
     rows: tuple[Figure, ...]
 
 
@@ -98,6 +114,7 @@ class Experiment:
     kept: bool = True
     draws: tuple[str, ...] = ()
     place: str = ""  # file and number of its entry
+    every: str = ""
 
     @property
     def function(self) -> Callable[..., Figures]:
@@ -118,14 +135,25 @@ class Experiment:
         return setup.out is None or all((setup.out / name).is_file() for name in self.draws)
 
     def rows(self, figures: Figures) -> list[Row]:
-        """Rows of figures that were measured; raises InputError if a row's text or bar has a name that there is none of."""
-        rows = []
+        """Rows of figures that were measured.
+
+        Raises
+        ------
+        InputError
+            If a row's text or bar has a name that there is none of, or a figure that `every` asks for is in none of them.
+        """
+        rows, used = [], set[str]()
         for one in self.figures:
             try:
-                rows += one.rows(self, figures)
+                rows += one.rows(self, figures, used)
             except (KeyError, IndexError, ValueError) as error:
                 expected = f"expected names of its settings, words and figures, which are {', '.join(figures)}"
                 raise InputError(f"{self.place}: {one.figure}: {expected}; found {error}") from error
+        if left := [name for name in figures if fnmatchcase(name, self.every) and name not in used]:
+            expected = f"expected a row for each figure like {self.every}"
+            raise InputError(
+                f"{self.place}: {expected}, found none for {', '.join(left)}; add it to a row's `each`, or change `every`"
+            )
         return rows
 
     def key(self, setup: Setup) -> str:
@@ -140,7 +168,7 @@ def read(path: Path) -> list[Experiment]:
     return [
         Experiment(
             *(path.stem, one.of, one.about, one.settings | dict(zip(one.over, values, strict=True)), one.words, one.needs),
-            *(one.rows, one.kept, one.draws, place),
+            *(one.rows, one.kept, one.draws, place, one.every),
         )
         for place, one in entries.items()
         for values in itertools.product(*one.over.values())
@@ -177,11 +205,11 @@ def _figures(key: str, one: Experiment, setup: Setup) -> tuple[str, Metrics]:
         return key, {name: float(value) for name, value in one.function(setup, **one.settings).items()}
 
 
-def _number(given: Number, known: Figures) -> float | None:
+def _number(given: Number, known: Known) -> float | None:
     """A number as it is given, or of a figure."""
     if not isinstance(given, str):
         return given
-    if (name := given.format(**known)) in known:
+    if (name := given.format_map(known)) in known:
         return float(known[name])
     product, _, divisor = name.partition(" / ")
     factor, _, name = product.rpartition(" ")

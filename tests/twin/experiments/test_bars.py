@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 
 from recon.errors import InputError
+from recon.files import yaml_text
 from recon.files.code_digest import code_digest
 from tests.twin.experiments.asked import CONF, FILES, experiments
+from twin.conditions import Conditions
 from twin.engine import Engine
-from twin.experiments import bars, experiment_runs, result_rows
+from twin.experiments import bars, experiment_runs, paper_causes, result_rows, trust_accuracy
 from twin.experiments.experiment_setup import Setup
 from twin.experiments.kept_figures import Kept, State
 
@@ -69,6 +71,33 @@ def test_a_figure_that_is_missing_is_an_error(group):
     """One line with file, entry and row, however many hours after the start."""
     with pytest.raises(InputError, match=r"group.yaml: entry 1: double_mm: .* which are double_mm; found 'limit_mm'"):
         group[0].rows({"double_mm": 1.0})
+
+
+def test_a_new_figure_without_a_row_is_refused(group):
+    """Where `every` asks for it; those in a text or a bar count."""
+    figures = {"double_mm": 2.0, "limit_mm": 1.0, "new: mm": 1.0, "new": 1.0}
+    assert group[0].rows(figures) and replace(group[0], every="*_mm").rows(figures)
+    with pytest.raises(
+        InputError, match=r"group.yaml: entry 1: expected a row for each figure like \*: \*, found none for new: mm;"
+    ):
+        replace(group[0], every="*: *").rows(figures)
+
+
+def test_settings_that_are_listed_are_all_that_there_are():
+    """Of boards, causes and studies: what is new gets a row, or fails here."""
+    life = Conditions.model_validate(yaml_text.read(CONF / "conditions" / "lifelike.yaml"))
+    assert listed("trust", "printed_board", "board") == set(trust_accuracy.BOARDS)
+    assert listed("lifelike", "one_cause", "cause") == set(paper_causes.causes(life))
+    of_boards = set(type(life.board).model_fields) - {"diameter_mm"}  # which moves no centre
+    assert listed("lifelike", "shares", "cause") == of_boards | {"flat, exact board", "all of them"}
+    beside = {path.stem for path in (CONF / "study").glob("*.yaml") if "beside" in yaml_text.read(path)}
+    assert listed("studies", "laboratories", "study") == beside - {"ultrasound_causes"}  # a cause at a time
+
+
+def listed(group: str, name: str, setting: str) -> set[str]:
+    """Values of a setting that an experiment is measured with."""
+    found = experiments(CONF / "bars" / "accuracy" / f"{group}.yaml")
+    return {one.settings[setting] for one in found if one.of.endswith(f".{name}")}
 
 
 def test_figures_are_kept_by_code_settings_and_inputs(group, rig, tmp_path, monkeypatch):
