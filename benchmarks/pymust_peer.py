@@ -3,12 +3,12 @@
     python -m venv VENV; VENV/bin/pip install pymust==0.1.9 pyyaml
     OMP_NUM_THREADS=1 VENV/bin/python benchmarks/pymust_peer.py
 
-Writes `benchmarks/pymust_peer.json` beside itself, in some minutes. PyMUST is no dependency: what reads the figures reads the
-file. Each line has the 64 elements around it; Hann windows, transmit focus and receive f-number are those of
-`conf/ultrasound/linear.yaml`. PyMUST gives the signals of the elements, with its own transducer and pulse; they are filtered,
-delayed and summed here. The filter is a Gaussian, as wide as makes the echo's bandwidth the twin's at that depth. Points are in
-three dimensions; the block of speckle is in two, for time: its lesion is a rod across the plane. Widths are full ones at half
-maximum of the envelope. Source: Garcia 2022, Computer Methods and Programs in Biomedicine 218 106726 (SIMUS).
+Writes `twin/experiments/pymust_peer.json`, in some minutes. PyMUST is no dependency: what reads the figures reads the file. Each
+line has the 64 elements around it; Hann windows, transmit focus and receive f-number are those of `conf/ultrasound/linear.yaml`.
+PyMUST gives the signals of the elements, with its own transducer and pulse; they are filtered, delayed and summed here. The
+filter is a Gaussian, as wide as makes the echo's bandwidth the twin's at that depth. Points are in three dimensions; the block of
+speckle is in two, for time: its lesion is a rod across the plane. Widths are full ones at half maximum of the envelope. Source:
+Garcia 2022, Computer Methods and Programs in Biomedicine 218 106726 (SIMUS).
 """
 
 import json
@@ -221,7 +221,7 @@ def main() -> None:
     for name in parts[0]:
         block_of[name] = float(np.mean([part[name] for part in parts]))
     record["block"] = block_of
-    (HERE / "pymust_peer.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    (HERE.parent / "twin" / "experiments" / "pymust_peer.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
-from recon.files.code_digest import code_digest
+from recon.files.code_digest import code_digest, is_unchanged
 from recon.files.metrics import Metrics
 from recon.probe_calibration import repeatability
 from recon.probe_calibration.sound_in_water import speed_of_sound
@@ -55,7 +55,13 @@ def sessions(setup: Setup, conditions: str, seeds: Sequence[int] = SEEDS) -> Fig
 
 
 def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
-    """Figures of one session, by estimated calibrations and tracked poses; those kept in a folder, if they are of this code."""
+    """Figures of one session, by estimated calibrations and tracked poses; those kept in a folder, if they are of this code.
+
+    Raises
+    ------
+    InputError
+        If code or settings were edited since this run took their digest, by which figures are kept.
+    """
     kept, key = None if out is None else Kept(out / "session"), f"{conditions}_{seed}_{code()}"
     if kept is not None and (found := kept.read(key)) is not None:
         return found
@@ -65,6 +71,9 @@ def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
     finally:
         shutil.rmtree(work)
     if kept is not None and whole:
+        if not is_unchanged(*PACKAGES, config.folder()):
+            expected = "expected code and conf/ as they were when the run began, found them edited meanwhile"
+            raise InputError(f"accuracy: {expected}; start it again, in a copy if you go on editing; what was kept before stays")
         kept.open()
         kept.keep(key, figures)
     return figures

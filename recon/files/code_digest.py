@@ -20,6 +20,11 @@ def code_digest(*places: str | Path) -> str:
     return found.hexdigest()[:12]
 
 
+def is_unchanged(*places: str | Path) -> bool:
+    """Whether packages and folders still are as this process found them when it first took their digest."""
+    return code_digest.__wrapped__(*places) == code_digest(*places)
+
+
 def _counts(name: Path) -> bool:
     """Whether a file may be code, or what code reads."""
     if any(part == "__pycache__" or part.startswith(".") for part in name.parts):

@@ -1,17 +1,16 @@
 """Measure the errors of the twin and of the pipeline, beside their bars, the limits of physics and the paper's figures.
 
-Reads the rig and the pattern sequences from conf/, what is measured and asked from conf/bars/accuracy/GROUP.yaml, and
-real recordings where `real` names their folder. Writes into the folder `out` results.parquet, a row a figure with experiment,
-settings, value, bar, limit, unit, day and commit, and pictures; figures of the same code and settings are kept in OUT/kept/,
-from which a run goes on that was stopped. With `document=docs/accuracy.md` the group's rows are replaced in docs/accuracy.csv,
-and the page's table is made of all rows there by conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for
-tracking, for which a thousand pairs of frames are rendered, an hour for studies and three hours for sessions. Exit status 1
-if a bar is missed.
+Reads the rig and the pattern sequences from conf/, what is measured and asked from conf/bars/accuracy/GROUP.yaml, and real
+recordings where `real` names their folder. Writes into the folder `out` results.parquet, a row a figure with experiment,
+settings, value, bar, limit, unit, day and commit, and pictures; figures of the same code and settings are kept in OUT/kept/
+with the day and the commit of their measurement, from which a run goes on that was stopped; times and the like are measured
+each time. With `document=docs/accuracy.md` the group's rows are replaced in docs/accuracy.csv, and the page's table is made
+of all rows there by conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for tracking, for which a
+thousand pairs of frames are rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -26,7 +25,7 @@ from twin.conditions import Conditions
 from twin.engine import Engine
 from twin.experiments import bars, document_tables, result_rows
 from twin.experiments.experiment_setup import Setup
-from twin.experiments.kept_figures import Kept
+from twin.experiments.kept_figures import Kept, State
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound.transducer import Transducer
 
@@ -65,10 +64,9 @@ def run(config: Config) -> int:
         raise InputError(f"accuracy: real: expected a folder of recordings, found none at {config.real}")
     table = config.out / result_rows.TABLE
     result_rows.read_table(table)
-    kept = Kept(config.out / "kept")
+    kept = Kept(config.out / "kept", State(*document_tables.state((config.document or folder()).parent)))
     kept.open()
     setup = setup_of(config.rig, config.real, config.out)
-    day, commit = document_tables.state((config.document or folder()).parent)
     console = Console(soft_wrap=True, highlight=False)
     met = True
     for group in groups:
@@ -77,7 +75,7 @@ def run(config: Config) -> int:
             verdict = {None: "    ", True: "ok  ", False: "MISS"}[row.met]
             bar = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.what}: {row.measured:.4g} {row.unit}{bar}", markup=False)
-            measured.append(replace(row, day=day, commit=commit))
+            measured.append(row)
         result_rows.write_table(table, group, measured)
         if config.document:
             result_rows.enter(config.document, shown, group, measured)

@@ -93,6 +93,16 @@ def test_figures_of_other_code_are_not_used(tmp_path, monkeypatch):
     assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 2.0}
 
 
+def test_figures_are_not_kept_of_code_that_was_edited_meanwhile(tmp_path, monkeypatch):
+    """Steps import late, so nobody can say which code they were of."""
+    (code := tmp_path / "code").mkdir()
+    monkeypatch.setattr(session_accuracy, "PACKAGES", (code,))
+    monkeypatch.setattr(session_accuracy, "session", lambda *of: (code / "a.py").write_text("") or (True, {"figure": 1.0}))
+    with pytest.raises(InputError, match="accuracy: expected code and conf/ as they were when the run began"):
+        session_accuracy.measured(tmp_path / "out", "ideal", 7)
+    assert not list(tmp_path.glob("out/**/*.json"))
+
+
 def test_a_session_of_which_a_step_failed_misses_its_bars(rig):
     """What is missing is NaN, wherever in the list of sessions it stands."""
     for found in ([{}, figures()], [figures(), {}]):

@@ -1,6 +1,7 @@
 """Accuracy of the B-mode model: against PyMUST, which follows every element of the array, and against diffraction.
 
-PyMUST's figures are kept in `benchmarks/pymust_peer.json`, with the command that makes them; it is no dependency.
+PyMUST's figures are kept in `pymust_peer.json` beside this module, so that they count as its code, with the command that makes
+them; it is no dependency.
 """
 
 import json
@@ -28,7 +29,7 @@ from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
-PEER = Path(__file__).resolve().parents[2] / "benchmarks" / "pymust_peer.json"
+PEER = Path(__file__).resolve().with_name("pymust_peer.json")
 QUIET = Transducer(noise_db=-200.0, face_ring_mm=0.0, reverberations=0, tgc_db_per_cm_mhz=0.0)
 REFERENCE = Tissue(1.6, 1540.0, 0.0, 0.0)
 EMPTY = Tissue(1.5, 1540.0, 0.0, None)

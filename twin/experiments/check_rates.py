@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,9 +62,9 @@ class Laboratory(NamedTuple):
     known: Uncertainty  # of it, when it is checked
 
 
-def rates(setup: Setup, life: str, rigs: int = RIGS) -> Figures:
+def rates(setup: Setup, life: Literal["ideal", "lifelike"], rigs: int = RIGS) -> Figures:
     """Draw rigs from one calibration, and check each as it is and with one part moved."""
-    lab = laboratory(setup.rig, {"ideal": IDEAL, "lifelike": setup.lifelike}[life], DRIFT_PX)
+    lab = laboratory(setup.rig, setup.conditions(life), DRIFT_PX)
     transducer = setup.scanners["water"]
     return _counted(lambda k, true: _optics(lab, MOVES, true, k) | _tank(lab, true, transducer, k), lab, rigs)
 

@@ -7,7 +7,8 @@ trial that is kept isn't done anew when these change.
 import hashlib
 import importlib.metadata
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -18,7 +19,7 @@ import cv2
 from pydantic import Field, field_validator, model_validator
 
 from recon.errors import InputError
-from recon.files.code_digest import code_digest
+from recon.files.code_digest import code_digest, is_unchanged
 from recon.files.metrics import Metrics
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
@@ -141,6 +142,29 @@ def digest(name: str, settings: Settings, seed: int) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:20]
 
 
+@contextmanager
+def same_code(asked: str, here: str) -> Iterator[None]:
+    """Measure figures that are kept under a name which is made of the code: it must be so here, before and afterwards.
+
+    asked, here : the name as who asks made it, and as it is on this machine
+
+    Raises
+    ------
+    InputError
+        If this machine's code or libraries aren't those of who asks, or code was edited meanwhile, some of which may have been
+        imported after that.
+    """
+    expected = "expected workers with the code and the libraries of this machine"
+    if asked != here:
+        raise InputError(
+            f"engine: {expected}, found others at {gethostname()}; was code edited since the run began? start it again"
+        )
+    yield
+    if not is_unchanged(*PACKAGES):
+        advice = "start it again, in a copy of the code if you go on editing; what was kept before stays"
+        raise InputError(f"engine: {expected}, found it edited meanwhile at {gethostname()}; {advice}")
+
+
 def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, Metrics | str]:
     """Run a trial, and give its figures, or in one line why there are none: settings that nothing can be measured with.
 
@@ -150,16 +174,12 @@ def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, 
     Raises
     ------
     InputError
-        If this machine's code or libraries aren't those of who asks.
+        As `same_code` does.
     """
-    if digest(name, settings, seed) != key:
-        raise InputError(
-            f"engine: expected workers with the code and the libraries of this machine, found others at {gethostname()}; "
-            "was code edited since the study began? start it again"
-        )
-    measure = experiment(name).measure
-    try:
-        return key, {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
-    except (ValueError, cv2.error) as error:  # InputError too
-        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-        return key, kind + " ".join(str(error).split())
+    with same_code(key, digest(name, settings, seed)):
+        measure = experiment(name).measure
+        try:
+            return key, {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
+        except (ValueError, cv2.error) as error:  # InputError too
+            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+            return key, kind + " ".join(str(error).split())

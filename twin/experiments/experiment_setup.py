@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
+from recon.errors import InputError
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from recon.session.store import files_of
@@ -30,7 +31,15 @@ class Setup:
     scanners: Mapping[str, Transducer] = field(default_factory=dict)  # by their names in conf/ultrasound
     frames: DataRanges | None = None  # of tracking frames, as in conf/dataset.yaml
     out: Path | None = None  # folder for figures; without it none is drawn
-    lifelike: Conditions = IDEAL  # as in conf/conditions/lifelike.yaml
+    lifelike: Conditions | None = None  # as in conf/conditions/lifelike.yaml
+
+    def conditions(self, life: Literal["ideal", "lifelike"]) -> Conditions:
+        """Conditions by name; raises InputError if those of life were not given, which no others may stand for."""
+        if life == "ideal":
+            return IDEAL
+        if self.lifelike is None:
+            raise InputError("conditions: expected lifelike ones, as in conf/conditions/lifelike.yaml, found none in this setup")
+        return self.lifelike
 
     @cached_property
     def digest(self) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from recon.errors import InputError
 from recon.files import atomic, json_text
@@ -20,11 +21,22 @@ from twin.engine import Engine, results
 Work = Callable[..., tuple[str, Metrics | str]]
 
 
+class State(NamedTuple):
+    """When and by which commit figures were measured."""
+
+    day: str  # UTC
+    commit: str
+
+
+UNKNOWN = State("", "")
+
+
 @dataclass(frozen=True)
 class Kept:
     """A folder of figures."""
 
     folder: Path
+    state: State = UNKNOWN  # of this run, to be written beside its figures
 
     def open(self) -> None:
         """Make the folder, and take away what a run that was killed left of a file."""
@@ -35,10 +47,22 @@ class Kept:
     def read(self, key: str) -> Metrics | None:
         """Figures that were kept before, if they are whole."""
         try:
-            figures = json_text.read(self._path(key))["figures"].items()
+            figures = self._record(key)["figures"].items()
             return {name: math.nan if value is None else float(value) for name, value in figures}
         except (InputError, ValueError, KeyError, AttributeError, TypeError):  # none, or damaged: done again
             return None
+
+    def state_of(self, key: str) -> State:
+        """The state that figures were kept with."""
+        try:
+            record = self._record(key)
+            return State(*(str(record.get(name, "")) for name in State._fields))
+        except (InputError, AttributeError):
+            return UNKNOWN
+
+    def forget(self, key: str) -> None:
+        """Measure anew what was kept."""
+        self._path(key).unlink(missing_ok=True)
 
     def keep(self, key: str, found: Metrics | str) -> None:
         """Keep figures; what gave none is tried again by a later run. A damaged file is set aside."""
@@ -50,7 +74,9 @@ class Kept:
             path.rename(aside)
         figures = {name: value if math.isfinite(value) else None for name, value in found.items()}
         with atomic.new_file(path) as temporary:
-            temporary.write_text(json.dumps({"figures": figures}) + "\n", encoding="utf-8")
+            temporary.write_text(
+                json.dumps({"figures": figures} | (self.state._asdict() if any(self.state) else {})) + "\n", encoding="utf-8"
+            )
 
     def run(self, engine: Engine, work: Work, tasks: Mapping[str, tuple]) -> Iterator[tuple[str, Metrics | str]]:
         """Key and figures of tasks, or the reason for none: kept ones first, the others as they are done.
@@ -66,6 +92,9 @@ class Kept:
         for key, found in results(engine, work, missing):
             self.keep(key, found)
             yield key, found
+
+    def _record(self, key: str) -> Any:
+        return json_text.read(self._path(key))
 
     def _path(self, key: str) -> Path:
         return self.folder / f"{key}.json"

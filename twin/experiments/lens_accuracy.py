@@ -50,7 +50,11 @@ class Judged:
 def far_from_points(setup: Setup, lenses: str, sets: int) -> Figures:
     """Lens models chosen automatically, or given though they are too rich for the points."""
     judged = [each(seed, lenses) for seed in SEEDS[:sets]]
-    return {"torn": sum(not one.one_to_one for one in judged), "inside": np.mean([one.inside for one in judged])}
+    return {
+        "judged": len(judged),
+        "torn": sum(not one.one_to_one for one in judged),
+        "inside": np.mean([one.inside for one in judged]),
+    }
 
 
 def each(seed: int, distortion: ModelName | str) -> Judged:

@@ -89,7 +89,7 @@ def session(setup: Setup, seed: int) -> board_session.Settings:
         surface_accuracy.TRACING,
         Shooting(),
         seed,
-        setup.lifelike,
+        setup.conditions("lifelike"),
     )
 
 
@@ -110,7 +110,7 @@ def shoot(session: board_session.Settings, patterns: Patterns) -> tuple[Experime
 
 def shares(setup: Setup, cause: str) -> Figures:
     """Reprojection by the paper's method, and form by both, of boards of one condition alone, of none, or of all together."""
-    errors, truth = setup.lifelike.board, calibration_of(setup.rig)
+    errors, truth = setup.conditions("lifelike").board, calibration_of(setup.rig)
     alone = {field: BoardPrint(**{field: getattr(errors, field)}) for field in BoardPrint.model_fields}
     chosen = ({"flat, exact board": BoardPrint(), "all of them": errors} | alone)[cause]
     ours, paper, px = [], [], []

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from time import perf_counter
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -78,9 +78,9 @@ class Errors(NamedTuple):
     predicted_within: float
 
 
-def against_random(setup: Setup, life: str) -> Figures:
+def against_random(setup: Setup, life: Literal["ideal", "lifelike"]) -> Figures:
     """Errors of points after guided poses over those after twice as many random ones; `steady`: poses held as asked."""
-    errors = {"ideal": BoardPrint(), "lifelike": setup.lifelike.board}[life]
+    errors = setup.conditions(life).board
     sessions = [Session(setup.rig, errors, seed) for seed in SEEDS]
     steady = [session._replace(missed=STEADY) for session in sessions]
     few, best = (over_seeds([figures(by_guidance(session), session) for session in each]) for each in (sessions, steady))

@@ -31,7 +31,7 @@ class Cause(NamedTuple):
 
 def one_cause(setup: Setup, cause: str) -> Figures:
     """RMS of planes, RMS and radius error of the sphere, as published and by our decoding."""
-    by_us, published = zip(*(compared(setup, causes(setup.lifelike)[cause], seed) for seed in SEEDS), strict=True)
+    by_us, published = zip(*(compared(setup, causes(setup.conditions("lifelike"))[cause], seed) for seed in SEEDS), strict=True)
     return {
         f"{name} {decoding}": np.mean([abs(getattr(one, name)) for one in results])
         for decoding, results in (("as published", published), ("by us", by_us))

@@ -1,15 +1,24 @@
 """The B-mode model against PyMUST's figures and against diffraction, as far as they are quick."""
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.twin.experiments.asked import missed
 from twin.experiments import bmode_accuracy
+from twin.experiments.experiment_runs import PACKAGES
 
 
 def test_widths_are_those_of_the_peer():
     """Near the face and beyond the foci; within 15 %, of which some 10 in depth are the shape of the peer's pulse."""
     assert not missed(bmode_accuracy.widths, bmode_accuracy.widths(None, (5.0, 35.0)))
+
+
+def test_the_peers_figures_count_as_code():
+    """Else rows that were kept would survive other figures of the peer."""
+    assert any(bmode_accuracy.PEER.is_relative_to(Path(find_spec(name).origin).parent) for name in PACKAGES)
 
 
 def test_speckle_and_lesions():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.twin.experiments.asked import rows
 from twin.experiments import lens_accuracy
 
 
@@ -12,3 +13,11 @@ def test_lenses_are_sound_and_honest_all_over_the_image(distortion, first):
     found = [lens_accuracy.each(seed, distortion) for seed in range(first, 12, 2)]
     assert all(one.one_to_one for one in found)
     assert np.mean([one.inside for one in found]) > 0.8
+
+
+def test_rows_tell_the_point_sets_that_there_are(monkeypatch):
+    """Not those that are asked for, where there are fewer seeds."""
+    monkeypatch.setattr(lens_accuracy, "SEEDS", range(3))
+    monkeypatch.setattr(lens_accuracy, "each", lambda seed, lenses: lens_accuracy.Judged(0.95, True))
+    found = lens_accuracy.far_from_points(None, "auto", 200)
+    assert rows(lens_accuracy.far_from_points, found, lenses="auto")[0].what.startswith("3 point sets, auto lenses: ")
