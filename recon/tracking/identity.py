@@ -12,6 +12,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.geometry.ellipses import Ellipses, root
 from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
@@ -44,11 +45,21 @@ class Naming:
 
 
 def namings(candidates: Candidates, target: Target, width: float) -> list[Naming]:
-    """Hypotheses of the target in a window of this width (px), the likeliest first: a candidate each circle, or one unseen."""
-    circles = circle_layout.count(target)
+    """Hypotheses of the target in a window of this width (px), the likeliest first: a candidate each circle, or one unseen.
+
+    Raises
+    ------
+    InputError
+        If the detector names another number of circles than the target has.
+    """
+    circles, known = circle_layout.count(target), candidates.identity.shape[1] - 1
+    if known != circles:
+        expected = f"expected a detector of {circles} circles, as rig.target of {target.kind} has, found one of {known}"
+        way = f"load networks with kind={target.kind}, and by_geometry=True where they were trained for another target"
+        raise InputError(f"networks: {expected}: {way}")
     points = np.vstack([candidates.points.reshape(-1, 2), np.full(2, np.nan)])
     scores = np.append(candidates.scores, LEAST_SCORE)
-    names = np.vstack([candidates.identity[:, :circles], np.full(circles, 1 / (circles + 1))])
+    names = np.vstack([candidates.identity[:, :-1], np.full(circles, 1 / (circles + 1))])
     order = _orders(len(points), circles)
     likely = np.log(np.maximum(names[order, range(circles)], UNNAMED)).sum(axis=1) + np.log(scores[order]).sum(axis=1)
     seen = order < len(points) - 1
