@@ -3,7 +3,8 @@
 World is the frame of camera 1. Every field has a unit; nonsense is refused with the field's name.
 """
 
-from itertools import permutations
+from collections.abc import Iterator
+from itertools import islice
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
@@ -15,6 +16,7 @@ from recon.geometry.camera import DISTORTION_LENGTHS, Camera
 from recon.model.lengths import TARGET_CIRCLE, TARGET_STEP
 from recon.model.part import Finite, Fraction, Kinds, NotNegative, Part, Positive, Vector
 
+MOST_CIRCLES = 8  # of a target, by the time that a search takes and the candidates that it has: half a second a window
 LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its circles can be told apart
 FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
 
@@ -111,7 +113,7 @@ class ProjectorDevice(Part):
 
 
 class Target(Kinds):
-    """The probe's planar target of any number of circles, whose places are known by lengths; see `recon.model.circle_layout`.
+    """The probe's planar target of three to eight circles, whose places are known by lengths; see `recon.model.circle_layout`.
 
     Which lengths there are, its kind tells: a module of `recon.model.targets`.
     """
@@ -161,11 +163,17 @@ class Target(Kinds):
     @model_validator(mode="after")
     def _names_can_be_told(self) -> Self:
         c1, *others = (getattr(self, name) for name in self.LENGTHS)
+        if (circles := len(others) // 2 + 2) > MOST_CIRCLES:
+            raise ValueError(
+                f"{self.LENGTHS[-1]}: expected up to {MOST_CIRCLES} circles, found {circles}: the search tries their orders"
+            )
+        if self.unusual:
+            return self
         places = np.array([0, c1, *map(complex, others[::2], others[1::2])])
         places = places - places.mean()
-        for order in list(permutations(range(len(places))))[1:]:
+        for order in islice(_alike(np.abs(places[:, None] - places)), 1, None):
             turn = np.vdot(places, turned := places[list(order)])
-            if np.abs(turned - places * turn / max(abs(turn), 1e-9)).max() < LEAST_ASYMMETRY_MM and not self.unusual:
+            if np.abs(turned - places * turn / max(abs(turn), 1e-9)).max() < LEAST_ASYMMETRY_MM:
                 raise ValueError(
                     f"{self.LENGTHS[-1]}: expected circles that no turn maps onto each other to {LEAST_ASYMMETRY_MM:g} mm, "
                     f"found c0 on c{order[0]}'s place: which is which can't be seen. If it is right, give unusual=true with it"
@@ -190,6 +198,16 @@ class Target(Kinds):
                 *first, last = (name.removesuffix("_mm") for name in cls.LENGTHS)
                 raise ValueError(f"expected a covariance of {', '.join(first)} and {last}, found {rows}")
         return value
+
+
+def _alike(far: rigid.Array, first: tuple[int, ...] = ()) -> Iterator[tuple[int, ...]]:
+    """Orders of n circles, first as they are, by whose distances : (n, n) mm a turn may map each nearly onto another."""
+    if (k := len(first)) == len(far):
+        yield first
+        return
+    for new in range(len(far)):
+        if new not in first and np.all(np.abs(far[new, list(first)] - far[k, :k]) < 2 * LEAST_ASYMMETRY_MM):
+            yield from _alike(far, (*first, new))
 
 
 class Probe(Part):

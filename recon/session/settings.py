@@ -15,13 +15,29 @@ from recon.registry import Choice
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 from recon.tracking import networks
+from recon.tracking.networks import OnnxNetworks
 from recon.tracking.tracker import Tracker
 
 Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
 OF_THE_SCALE = "rig.probe.scale_mm_per_px"
 
 
-class TrackingFields(Part):
+class NetworkFields(Part):
+    """Fields of a step that looks for the target by networks."""
+
+    networks: Path | None = None
+    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
+    naming: Literal["networks", "geometry"] = "networks"
+    """by which a circle gets its name: networks that were trained for this kind of target; or its place among the others alone,
+    with any networks: slower, and of covered circles fewer are found"""
+
+    def load_networks(self, kind: str, threads: int) -> OnnxNetworks:
+        """The networks for a kind of target; InputError as of `recon.tracking.networks.load`."""
+        way = f"train it with a data set of {kind}, or give naming=geometry: circles' names by their places alone"
+        return networks.load(self.networks or networks.WEIGHTS, threads, kind, self.naming == "geometry", way)
+
+
+class TrackingFields(NetworkFields):
     """Fields of a step that tracks the target by cameras some time after their calibration."""
 
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
@@ -30,11 +46,6 @@ class TrackingFields(Part):
     board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
     """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
     less: of paper by moisture; 1e-5 of chrome on glass"""
-    networks: Path | None = None
-    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
-    naming: Literal["networks", "geometry"] = "networks"
-    """by which a circle gets its name: networks that were trained for this kind of target; or its place among the others alone,
-    with any networks: slower, and of covered circles fewer are found"""
 
 
 class TrackerFields(TrackingFields):
@@ -126,6 +137,5 @@ def make_tracker(
     InputError
         If a network is missing, isn't one, or is of another kind of target.
     """
-    folder, by_geometry = fields.networks or networks.WEIGHTS, fields.naming == "geometry"
-    loaded = networks.load(folder, fields.threads, target.kind, by_geometry)
+    loaded = fields.load_networks(target.kind, fields.threads)
     return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)

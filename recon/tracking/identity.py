@@ -5,6 +5,7 @@ Scale and tilt must be possible, the front must face the camera (the cross produ
 and the ellipses must be those that the distances ask for; of three circles that alone tells names that turn the same way round.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
@@ -12,6 +13,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.geometry.ellipses import Ellipses, root
 from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
@@ -26,6 +28,8 @@ TILTED = 0.36  # least ratio of scales across and along the tilt: 69 degrees
 DISC = (0.027, 0.25)  # diameter of a disc, of the width of the detector's window
 UNNAMED = 1e-3  # no identity is less likely than that: a network may be wrong
 ALIKE = 0.15  # of a disc's size, by which an ellipse may differ from what the distances ask for
+FIRST = 4  # circles that are tried in all orders
+LINE = 0.25  # of the spread of circles along a line, that across which they lie nearly in it
 KEPT = 6  # namings a view
 HALVES = 3  # with one circle unseen
 ASTRAY = 1.0  # of a disc's radius, by which one of more than three circles may be off where an affine view has it: perspective
@@ -44,32 +48,50 @@ class Naming:
 
 
 def namings(candidates: Candidates, target: Target, width: float) -> list[Naming]:
-    """Hypotheses of the target in a window of this width (px), the likeliest first: a candidate each circle, or one unseen."""
-    circles = circle_layout.count(target)
+    """Hypotheses of the target in a window of this width (px), the likeliest first: a candidate each circle, or one unseen.
+
+    Raises
+    ------
+    InputError
+        If the detector names another number of circles than the target has.
+    """
+    circles, known = circle_layout.count(target), candidates.identity.shape[1] - 1
+    if known != circles:
+        expected = f"expected a detector of {circles} circles, as rig.target of {target.kind} has, found one of {known}"
+        way = f"load networks with kind={target.kind}, and by_geometry=True where they were trained for another target"
+        raise InputError(f"networks: {expected}: {way}")
     points = np.vstack([candidates.points.reshape(-1, 2), np.full(2, np.nan)])
     scores = np.append(candidates.scores, LEAST_SCORE)
-    names = np.vstack([candidates.identity[:, :circles], np.full(circles, 1 / (circles + 1))])
-    order = _orders(len(points), circles)
+    names = np.vstack([candidates.identity[:, :-1], np.full(circles, 1 / (circles + 1))])
+
+    def possible(order: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether candidates : (m, k) can be the first k circles."""
+        seen, fit = order < len(points) - 1, np.empty(len(order), bool)
+        for some in (np.ones(order.shape[1], bool), *~np.eye(order.shape[1], dtype=bool)):
+            rows = (seen == some).all(axis=1)
+            fit[rows] = _possible(points[order[rows]], some, target, width)
+        return fit
+
+    order = _rows(len(points), circles, possible)
     likely = np.log(np.maximum(names[order, range(circles)], UNNAMED)).sum(axis=1) + np.log(scores[order]).sum(axis=1)
     seen = order < len(points) - 1
-    whole, possible = seen.all(axis=1), np.empty(len(order), bool)
-    for some in (np.ones(circles, bool), *~np.eye(circles, dtype=bool)):
-        rows = (seen == some).all(axis=1)
-        possible[rows] = _possible(points[order[rows]], some, target, width)
+    whole, fit = seen.all(axis=1), possible(order)
     ranked = np.argsort(-likely, kind="stable")
-    best = np.concatenate([ranked[(possible & whole)[ranked]][:KEPT], ranked[(possible & ~whole)[ranked]][:HALVES]])
+    best = np.concatenate([ranked[(fit & whole)[ranked]][:KEPT], ranked[(fit & ~whole)[ranked]][:HALVES]])
     return [Naming(points[order[k]], float(likely[k])) for k in sorted(best, key=lambda k: -likely[k])]
 
 
 def _possible(points: Array, seen: NDArray[np.bool_], target: Target, width: float) -> NDArray[np.bool_]:
-    """Whether points : (m, n, 2) px, of which those of `seen` : (n,) count, can be the circles: by scale, tilt and places.
+    """Whether points : (m, k, 2) px, of which those of `seen` : (k,) count, can be the first k circles: by scale, tilt, places.
 
-    Of two circles the distance alone counts.
+    Of two circles the distance alone counts; of the first ones of more, nothing does where these lie nearly in a line.
     """
     if seen.sum() < POINTS:
         size = stretch(points, target) * target.outer_diameter_mm / width
         return (size > TILTED * DISC[0]) & (size < DISC[1])
-    places = circle_centres(target)[seen, :2]
+    places = circle_centres(target)[: len(seen)][seen, :2]
+    if len(seen) < circle_layout.count(target) and _in_line(places):
+        return np.ones(len(points), bool)
     affine = affinity_of(points[:, seen], places)
     scales = np.linalg.svd(affine, compute_uv=False)
     size = scales[:, 0] * target.outer_diameter_mm / width
@@ -88,14 +110,20 @@ def affinity(points: Array, target: Target) -> Array:
 
 
 def affinity_of(points: Array, places: Array) -> Array:
-    """The affinity : (..., 2, 2) px/mm that takes places : (n, 2) mm to points : (..., n, 2) px with least squares."""
-    from_middle, arms = points - points.mean(axis=-2, keepdims=True), places - places.mean(axis=0)
-    return np.swapaxes(from_middle, -1, -2) @ np.linalg.pinv(arms.T)
+    """The affinity : (..., 2, 2) px/mm that takes places : (..., n, 2) mm to points : (..., n, 2) px with least squares."""
+    from_middle, arms = (each - each.mean(axis=-2, keepdims=True) for each in (points, places))
+    return np.swapaxes(from_middle, -1, -2) @ np.linalg.pinv(np.swapaxes(arms, -1, -2))
+
+
+def _in_line(places: Array) -> NDArray[np.bool_]:
+    """Whether places : (..., n, 2) lie nearly in a line, so that their affinity isn't known across it."""
+    across = np.linalg.svd(places - places.mean(axis=-2, keepdims=True), compute_uv=False)
+    return across[..., 1] < LINE * across[..., 0]
 
 
 def _astray(points: Array, places: Array, affine: Array) -> Array:
     """Largest distances : (...) px of points : (..., n, 2) from where their affinities have them."""
-    from_middle, arms = points - points.mean(axis=-2, keepdims=True), places - places.mean(axis=0)
+    from_middle, arms = (each - each.mean(axis=-2, keepdims=True) for each in (points, places))
     return np.linalg.norm(from_middle - arms @ np.swapaxes(affine, -1, -2), axis=-1).max(axis=-1)
 
 
@@ -117,10 +145,42 @@ def disagreement(ellipses: Ellipses, target: Target) -> float:
 
 def named(ellipses: Ellipses, target: Target) -> tuple[NDArray[np.int64], float]:
     """The order in which n ellipses are c0, c1 and on by their geometry, and their disagreement then."""
-    orders = _orders(*2 * (len(ellipses.centre),))
+    seen, places = np.flatnonzero(np.isfinite(ellipses.centre).all(axis=1)), circle_centres(target)[:, :2]
+    circles = len(places)
+
+    def possible(names: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the first k that are seen can be the circles of `names` : (m, k)."""
+        points, there = ellipses.centre[seen[: names.shape[1]]], places[names]
+        affine = affinity_of(points, there)
+        size = np.linalg.svd(affine, compute_uv=False)[:, 0] * target.outer_diameter_mm / 2
+        return _in_line(there) | ((np.linalg.det(affine) < 0) & (_astray(points, there, affine) < ASTRAY * size))
+
+    as_they_are = np.arange(circles)
+    orders = [as_they_are, *(_order(seen, names, circles) for names in _rows(circles, len(seen), possible))]
     off = [disagreement(ellipses[order], target) for order in orders]
     best = int(np.argmin(off))
     return orders[best], off[best]
+
+
+def _order(seen: NDArray[np.int64], names: NDArray[np.int64], circles: int) -> NDArray[np.int64]:
+    """The order of n circles with those that are seen : (k,) under names : (k,)."""
+    order = np.empty(circles, np.int64)
+    order[names] = seen
+    order[np.setdiff1d(np.arange(circles), names)] = np.setdiff1d(np.arange(circles), seen)
+    return order
+
+
+def _rows(count: int, length: int, possible: Callable[[NDArray[np.int64]], NDArray[np.bool_]]) -> NDArray[np.int64]:
+    """Rows : (m, length) of different numbers below `count`, in alphabetical order.
+
+    Of more than FIRST numbers those alone of which the first four, five and on are `possible`: all would be too many.
+    """
+    rows = _orders(count, min(length, FIRST))
+    while rows.shape[1] < length:
+        rows = rows[possible(rows)]
+        row, new = np.nonzero((rows[:, :, None] != np.arange(count)).all(axis=1))
+        rows = np.column_stack([rows[row], new])
+    return rows
 
 
 @cache

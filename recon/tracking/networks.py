@@ -66,13 +66,16 @@ class OnnxNetworks:
         return np.asarray(self.segmenter.run(["mask"], {"patch": np.ascontiguousarray(patches[:, None], np.float32)})[0])[:, 0]
 
 
-def load(folder: Path = WEIGHTS, threads: int = 0, kind: str = THREE_CIRCLES, by_geometry: bool = False) -> OnnxNetworks:
+def load(
+    folder: Path = WEIGHTS, threads: int = 0, kind: str = THREE_CIRCLES, by_geometry: bool = False, way: str = ""
+) -> OnnxNetworks:
     """Load `detector.onnx` and `segmenter.onnx`, to run on `threads` cores, 0 for all.
 
     Parameters
     ----------
     kind : of target that is to be found, a module of `recon.model.targets`
     by_geometry : whether the detector's names of circles don't count, as one's of another kind of target
+    way : out of the refusal of another kind of target, for the message
 
     Raises
     ------
@@ -83,8 +86,8 @@ def load(folder: Path = WEIGHTS, threads: int = 0, kind: str = THREE_CIRCLES, by
     found, circles = session(detector, DETECTOR, threads), circle_layout.count(Target.named(kind))
     trained = found.get_modelmeta().custom_metadata_map.get(TRAINED_FOR, THREE_CIRCLES)
     if not by_geometry and trained != kind:
-        way = f"train it with a data set of {kind}, or give naming=geometry: circles' names by their places alone"
-        raise InputError(f"{detector}: expected a detector of {kind}, as rig.target is, found one of {trained}; {way}")
+        found_one = f"found one of {trained}" + (f"; {way}" if way else "")
+        raise InputError(f"{detector}: expected a detector of {kind}, as rig.target is, {found_one}")
     named = {node.name: node.shape[1] for node in found.get_outputs()}["identity"]
     if not by_geometry and isinstance(named, int) and named != circles + 1:
         raise InputError(f"{detector}: expected {circles + 1} identities of {kind}, found {named}")

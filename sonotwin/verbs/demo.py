@@ -40,7 +40,7 @@ def run(config: Config) -> None:
     """
     console = Console(soft_wrap=True, highlight=False)
     if config.looks_inside or config.film_frames:
-        networks.load()  # before minutes of work
+        networks.load(kind=config.rig.target.kind)  # before minutes of work
     parse_scene(config.scene)
     if config.poses is not None:
         board_session.check_place(config.board)

@@ -48,7 +48,7 @@ from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.registry import Choice
-from recon.tracking import networks
+from recon.session.settings import NetworkFields
 from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
 from twin.session import CAPTURE, TRUTH
@@ -91,7 +91,7 @@ class Triggering(Part):
         return Streamed(self.wait_frames, self.by, self.timeout_s)
 
 
-class Config(Part):
+class Config(NetworkFields):
     """Fields of `sonotwin record`."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -264,12 +264,12 @@ def sweep(config: Config, recording: Recording, console: Console, say: Say, show
     silent_s = config.silent_s * (1 if isinstance(config.devices, LiveDevices) else SLOWER)
     triggers = config.devices.sweep_triggers if isinstance(config.devices, LiveDevices) else ("hardware", "hardware")
     plan = SweepPlan(config.name, config.purpose, triggers, config.seconds, silent_s, config.limits)
+    judge = target_judge(config.load_networks(config.rig.target.kind, threads=1), config.rig.target)
     with sweep_devices(config, exposure_s, console) as (opened, operator, cameras):
         devices = dict(cameras)
         calibrations(config, recording, {name: device.size for name, device in devices.items()})
         if opened.scanner is not None:
             devices[SCANNER] = Device(size=opened.scanner.size)
-        judge = target_judge(networks.load(threads=1, kind=config.rig.target.kind), config.rig.target)
         record_sweep(recording, opened.pairs, opened.scanner, devices, operator, plan, dict.fromkeys(cameras, judge), say, show)
 
 

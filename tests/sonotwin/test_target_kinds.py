@@ -17,8 +17,10 @@ from recon.model.rig import Rig
 from recon.tracking import networks
 from recon.tracking.pose import estimate
 from recon.tracking.pose_fit import Sighting
+from recon.tracking.tracker import Tracker
 from sonotwin import config
 from sonotwin.cli import main
+from sonotwin.verbs import record
 from sonotwin.verbs.print import Config
 from tests import added
 from tests.recon import captures
@@ -186,6 +188,31 @@ def test_the_verbs_take_it(drawn, described, four, tmp_path, capsys):
     assert f"found       {COUNT} of {COUNT} frames" in capsys.readouterr().out
     assert main(["track", f"capture={drawn}", f"target={out / 'target.yaml'}", f"out={tmp_path / 'other'}"]) == 2
     assert "parameters: expected c1_mm c2_aside_mm c2_mm outer_diameter_mm" in capsys.readouterr().err
+
+
+def test_networks_of_three_circles_are_no_others(rig, four, rng):
+    """A tracker with them refuses four circles, whose fourth would be taken for none; by geometry they are taken."""
+    pair = (rig.cam1.optics.camera(), rig.cam2.optics.camera())
+    left, right = rng.integers(0, 255, (2, *pair[0].size[::-1]), dtype=np.uint8)
+    with pytest.raises(InputError, match=r"expected a detector of 4 circles, .* found one of 3: .*kind=four_circles"):
+        Tracker(pair, four.target, networks.load(threads=1)).step(left, right)
+    by_geometry = networks.load(threads=1, kind="four_circles", by_geometry=True)
+    assert not Tracker(pair, four.target, by_geometry).step(left, right).found
+    with pytest.raises(InputError, match="found one of 4"):
+        Tracker(pair, rig.target, by_geometry).step(left, right)
+
+
+def test_what_looks_for_the_target_refuses_them_at_once(described, tmp_path, capsys):
+    """Before devices are opened or a scene is rendered; recording can name circles by geometry, as tracking."""
+    out = tmp_path / "out"
+    assert main(["demo", described, f"out={out}", f"board={tmp_path / 'board'}"]) == 2
+    said = capsys.readouterr().err
+    assert "expected a detector of four_circles" in said and "naming" not in said
+    recorded = ["part=sweep", described, "preview.serve=false", f"out={out}"]
+    assert main(["record", *recorded]) == 2
+    assert "or give naming=geometry" in capsys.readouterr().err and not out.exists()
+    known = config.load("record", [*recorded, "naming=geometry"], record.Config).load_networks("four_circles", threads=1)
+    assert known.detect(np.zeros((1, 240, 320), np.float32))[1].shape == (1, 5, 30, 40)
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def rates(setup: Setup, samples: int = SAMPLES) -> Figures:
     """Rates of finding, of wrong names and of false alarms, in %."""
     setup = exactly_printed(setup)
     unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, samples) for seed in SEEDS)
-    seen = list(scored(unseen, setup.rig.target, nets.load()))
+    seen = list(scored(unseen, setup.rig.target, nets.load(kind=setup.rig.target.kind)))
     there = [view for view in seen if view.shows_target and view.blur_px <= BLURRED_PX]
     lit = [view for view in there if view.white_dn >= LIT_DN]
     dim = [view for view in there if DIM_DN <= view.white_dn < LIT_DN]

@@ -71,7 +71,7 @@ def opened(settings: Settings, seed: int) -> Iterator[FilmedLaboratory]:
     level = settings.noise.drawn.latency * settings.noise.latency_s
     latency = Clocks().lag_s + level * float(np.random.default_rng([seed, 31]).standard_normal())
     with TemporaryDirectory() as folder:
-        yield FilmedLaboratory(settings, seed, rig, optics, latency, networks.load(), Path(folder))
+        yield FilmedLaboratory(settings, seed, rig, optics, latency, networks.load(kind=rig.target.kind), Path(folder))
 
 
 def swept(lab: FilmedLaboratory, name: str, scene: dict, path: AnyPath, clocks: Clocks, transducer: Transducer) -> TrackedSweep:

@@ -46,7 +46,7 @@ class Located:
 
 def moving_centres(setup: Setup, blur_px: float) -> Figures:
     """Median error of centres in motion."""
-    setup, known = exactly_printed(setup), nets.load()
+    setup, known = exactly_printed(setup), nets.load(kind=setup.rig.target.kind)
     shown = tracking_frames.study(setup, SEED, BLURRED, LIT_DN, blur_px)
     return centres([located(take, given, setup.rig.target, known) for take, given in shown])
 
@@ -61,7 +61,7 @@ def centres(errors: Sequence[Located]) -> Figures:
 
 def poses_at_rest(setup: Setup) -> Figures:
     """Errors of centres and poses, static and lit, over the working volume; whether covariances hold; the published recipe's."""
-    setup, known = exactly_printed(setup), nets.load()
+    setup, known = exactly_printed(setup), nets.load(kind=setup.rig.target.kind)
     sample = list(tracking_frames.study(setup, SEED, COUNT, LIT_DN, 0.0, FINE))
     errors = [located(take, given, setup.rig.target, known) for take, given in sample]
     recipe = [pose_errors(take, published_recipe(known)(cameras_of(take), given.views)) for take, given in sample]

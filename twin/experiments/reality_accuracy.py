@@ -76,7 +76,7 @@ def skins(setup: Setup, spread_mm: float, wet: float) -> Figures:
 def covered(setup: Setup) -> Figures:
     """Views in which up to half of a disc is covered, lit and blurred as those that tracking is asked for."""
     unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, SAMPLES) for seed in COVERED)
-    seen = list(detection_rates.scored(unseen, setup.rig.target, nets.load()))
+    seen = list(detection_rates.scored(unseen, setup.rig.target, nets.load(kind=setup.rig.target.kind)))
     partly = [view for view in seen if view.covered and detection_rates.sharp_and_lit(view)]
     false = sum(view.found and not view.right for view in seen)
     rightly = detection_rates.percent(view.right for view in partly)

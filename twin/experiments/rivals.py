@@ -71,7 +71,7 @@ def choices(target: Target, networks: Networks) -> list[Choice]:
 def grid(setup: Setup) -> Figures:
     """Summaries of the grid; a figure of all its cells in `setup.out`."""
     setup = exactly_printed(setup)
-    alike = groupby(choices(setup.rig.target, nets.load()), key=lambda choice: id(choice.face))
+    alike = groupby(choices(setup.rig.target, nets.load(kind=setup.rig.target.kind)), key=lambda choice: id(choice.face))
     tried = [one for _, some in alike for one in over_grid(setup, list(some))]
     if setup.out is not None:
         draw(tried, setup.out / FIGURE)

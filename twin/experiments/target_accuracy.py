@@ -44,7 +44,7 @@ class Tracked:
 def designs(setup: Setup) -> Figures:
     """Designs that the target differs from, before and after it was measured, beside the target's own."""
     shown, actual = list(tracking_frames.study(setup, SEED, COUNT, LIT_DN, 0.0, RAYS)), setup.rig.target
-    found_by = nets.load()
+    found_by = nets.load(kind=setup.rig.target.kind)
     exact = [tracked(shown, actual.model_copy(update={"tolerance_mm": 0.0}), found_by)]
     before, after, errors, squared = [], [], [], []
     for seed in PRINTS:
@@ -67,7 +67,7 @@ def designs(setup: Setup) -> Figures:
 def false_poses(setup: Setup) -> Figures:
     """Poses that are wrong, in frames as in a data set, dark, moving and covered, tracked with wrong designs."""
     unseen = chain.from_iterable(tracking_frames.unseen(setup, seed, SAMPLES) for seed in UNSEEN)
-    found_by, wrong = nets.load(), [misprinted(setup.rig.target, seed) for seed in PRINTS[:DESIGNS]]
+    found_by, wrong = nets.load(kind=setup.rig.target.kind), [misprinted(setup.rig.target, seed) for seed in PRINTS[:DESIGNS]]
     false = sum(_wrong(one, design, found_by) for one in unseen for design in wrong)
     return {"false": false, "pairs": len(UNSEEN) * SAMPLES * len(wrong)}
 

@@ -18,6 +18,6 @@ def photograph(setup: Setup) -> Figures:
     """Circles of a real photograph that are found at their places, under their names."""
     assert setup.real is not None
     image = cv2.imread(str(setup.real / PHOTO), cv2.IMREAD_GRAYSCALE)
-    view = photographs.find(image, nets.load(), exactly_printed(setup).rig.target)
+    view = photographs.find(image, nets.load(kind=setup.rig.target.kind), exactly_printed(setup).rig.target)
     away = np.linalg.norm(view.outlines.ellipses.centre - PHOTO_PX, axis=1)
     return {"right": (away < BY_EYE_PX).sum() if view.found else 0}

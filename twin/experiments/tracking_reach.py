@@ -61,7 +61,7 @@ class Reached:
 
 def drawn_rigs(setup: Setup, count: int = COUNT, most_px: float = np.inf) -> Figures:
     """Shares found, and wrong ones; of rigs of `most_px` pixels at most."""
-    reached = list(tracked(exactly_printed(setup), nets.load(), SEED, count, most_px))
+    reached = list(tracked(exactly_printed(setup), nets.load(kind=setup.rig.target.kind), SEED, count, most_px))
     found, wrong = 100 * np.mean([one.how is not None for one in reached]), sum(one.wrong for one in reached)
     return {"pairs": len(reached), "found_percent": found, "wrong": wrong}
 

@@ -59,7 +59,7 @@ def printed_target(setup: Setup) -> Figures:
     """The target on A4, as the tracker finds it."""
     target = setup.rig.target
     image, pixel = raster(target_drawing.card_of(target))
-    outlines = photographs.find(image, networks.load(), target).outlines
+    outlines = photographs.find(image, networks.load(kind=target.kind), target).outlines
     off = misfit(outlines.ellipses.centre * pixel * [1, -1], circle_centres(target))
     wide = np.abs(2 * outlines.ellipses.semi_axes * pixel.mean() - target.outer_diameter_mm).max()
     return {"dpi": DPI, "centres_mm": off, "diameters_mm": wide}

@@ -5,6 +5,7 @@ is missing), `face_row`, the row at which echoes have no delay (0 likewise), and
 `recon.model.probe`, and `covariance`.
 """
 
+from codecs import BOM_UTF8
 from pathlib import Path
 
 import cv2
@@ -24,8 +25,10 @@ PARAMETERS = ("sx", "sy", "rx", "ry", "rz", "tx", "ty", "tz")
 
 
 def recognises(path: Path) -> bool:
-    """Whether OpenCV's file names the schema."""
-    return SCHEMA.encode() in read_bytes(path, opencv_storage.MOST_BYTES, "a probe's calibration")
+    """Whether it is OpenCV's storage, of any of its three kinds, and names the schema."""
+    text = read_bytes(path, opencv_storage.MOST_BYTES, "a probe's calibration").removeprefix(BOM_UTF8).lstrip()
+    storage = text.startswith((b"%YAML", b"{")) or (text.startswith(b"<") and b"opencv_storage" in text)
+    return storage and SCHEMA.encode() in text
 
 
 def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:

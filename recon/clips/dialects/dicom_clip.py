@@ -25,6 +25,7 @@ from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, ExplicitVRLittleEnd
 from recon.capture.image_formats import MOST_PX
 from recon.clips import lossless_jpeg
 from recon.clips.clip import Box, Clip, checked_seconds
+from recon.clips.dialects import video_clip
 from recon.errors import InputError, reason, short
 from recon.files.regular import check_there, opened
 
@@ -44,10 +45,10 @@ DAMAGED = (  # what pydicom raises for files that are no DICOM, damaged, or comp
 
 
 def recognises(path: Path) -> bool:
-    """Whether it bears DICOM's mark, which some old ones lack."""
-    if not path.is_file():
+    """Whether it bears DICOM's mark, which some old ones lack, and isn't named as a video, in which OpenCV may find one."""
+    if video_clip.recognises(path) or not path.is_file():
         return False
-    with opened(path, MOST_BYTES) as stream:
+    with opened(path) as stream:
         return stream.read(PREAMBLE + len(PREFIX))[PREAMBLE:] == PREFIX
 
 

@@ -1,4 +1,4 @@
-"""Targets of the probe. Each module is a kind of target: circles with identities, c0, c1, c2 and on, at places that lengths tell.
+"""Targets of the probe. Each module is a kind of target: three to eight circles, c0, c1, c2 and on, at places that lengths tell.
 
 A module has `Kind`, a subclass of `recon.model.rig.Target` with
 

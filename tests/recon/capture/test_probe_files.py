@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from recon.capture import probe_files
+from recon.capture.probe_dialects import own_probe
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
@@ -131,3 +132,23 @@ def test_a_plain_matrix_is_told_a_way_that_it_has(tmp_path, caplog):
     assert probe_files.read(path, 1488.0).speed_m_s == 1488.0 and not caplog.messages
     assert probe_files.read(path).speed_m_s == 1540.0
     assert [f"made in water, give it as {authors.name}" in text for text in caplog.messages] == [True]
+
+
+def test_a_note_of_our_schema_makes_no_file_ours(probe, tmp_path):
+    """A configuration of PLUS may say where its matrix is from. Ours are those of OpenCV, in each of its ways to write."""
+    placed = probe.target_from_image @ np.diag([*probe.scale, 1, 1])
+    plus = tmp_path / "config.xml"
+    words = " ".join(map(repr, placed.ravel().tolist()))
+    transform = f'<Transform From="Image" To="Probe" Matrix="{words}"/>'
+    note = f"<!-- of {own_probe.SCHEMA} -->"
+    plus.write_text(f"<PlusConfiguration>{note}{transform}</PlusConfiguration>", encoding="utf-8")
+    assert not own_probe.recognises(plus)
+    assert probe_files.read(plus, 1488.3).target_from_image == pytest.approx(probe.target_from_image)
+    for suffix in ("yaml", "xml", "json"):
+        own = tmp_path / f"own.{suffix}"
+        storage = cv2.FileStorage(str(own), cv2.FileStorage_WRITE)
+        storage.write("schema", own_probe.SCHEMA)
+        storage.write("target_from_image", probe.target_from_image)
+        storage.write("scale", probe.scale.reshape(1, 2))
+        storage.release()
+        assert own_probe.recognises(own) and probe_files.read(own).scale == pytest.approx(probe.scale)

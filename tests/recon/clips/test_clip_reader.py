@@ -154,6 +154,19 @@ def test_a_compression_that_cant_be_read_is_named(tmp_path):
         clip_reader.read(tmp_path / "scan.dcm")
 
 
+def test_a_clip_of_any_size_is_recognised_and_a_dicom_file_bounded(tmp_path, monkeypatch):
+    """A video may be larger than any DICOM file that is read; its name's ending counts, whatever is in it."""
+    made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(2), FrameTime=50.0)
+    (tmp_path / "long.mpg").write_bytes((tmp_path / "scan.dcm").read_bytes())
+    (tmp_path / "other").write_bytes(bytes(200))
+    monkeypatch.setattr(dicom_clip, "MOST_BYTES", 100)
+    assert [dicom_clip.recognises(tmp_path / name) for name in ("scan.dcm", "long.mpg", "other")] == [True, False, False]
+    with pytest.raises(InputError, match=r"scan\.dcm: expected a file of up to"):
+        clip_reader.read(tmp_path / "scan.dcm")
+    with pytest.raises(InputError, match=r"long\.mpg: expected a video"):
+        clip_reader.read(tmp_path / "long.mpg")
+
+
 def test_damaged_files_are_refused_by_name(tmp_path):
     made_clips.write_dicom(tmp_path / "scan.dcm", made_clips.scans(3), FrameTime=50)
     content = (tmp_path / "scan.dcm").read_bytes()
