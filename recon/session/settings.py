@@ -7,17 +7,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
-from recon.capture import target_files
-from recon.geometry.camera import Camera
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
-from recon.model.rig import NotNegative, Part, Probe, Rig, Target
-from recon.registry import Choice
+from recon.model.calibration import DRIFT_PX, PRINT_SCALE
+from recon.model.rig import NotNegative, Part, Probe
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
-from recon.tracking import networks
-from recon.tracking.tracker import Tracker
 
 Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
+Spacing = Annotated[float, Field(ge=0.01, le=100)]  # mm, of a volume's voxels
 OF_THE_SCALE = "rig.probe.scale_mm_per_px"
 
 
@@ -37,26 +33,11 @@ class TrackingFields(Part):
     with any networks: slower, and of covered circles fewer are found"""
 
 
-class TrackerFields(TrackingFields):
-    """Fields of a step that tracks the target by a tracker of its own."""
-
-    rig: Annotated[Rig, Choice("meza2021")]
-    """of it, the target's design: distances and diameters of its circles, and their tolerance"""
-    calibration: Path | None = None
-    """file of the devices' calibration, used instead of the capture's own"""
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
-    """cores for the networks, 0 for all; another number may change last digits"""
-
-
 class TargetField(Part):
     """The field of a step that tracks the target as it was measured, if it was."""
 
     target: Path | None = None
     """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
-
-
-class MeasuredTargetFields(TargetField, TrackerFields):
-    """Fields of a step that tracks the target as it was measured, by a tracker of its own."""
 
 
 def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
@@ -103,29 +84,3 @@ class ScaleFields(Part):
         if self.scale_given or given.scale_mm_per_px != usual.scale_mm_per_px:
             return given.scale_mm_per_px[1]
         return None if given.image_size == usual.image_size else np.nan
-
-
-def target_of(fields: MeasuredTargetFields) -> Target:
-    """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
-    design = fields.rig.target
-    return design if fields.target is None else target_files.read(fields.target, design)
-
-
-def make_tracker(
-    fields: TrackerFields, target: Target, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
-) -> Tracker:
-    """The tracker of a target, by cameras some time after their calibration.
-
-    Parameters
-    ----------
-    known : of the cameras' calibration; None where it has none
-    bits : of frames deeper than 8 bits; None of others
-
-    Raises
-    ------
-    InputError
-        If a network is missing, isn't one, or is of another kind of target.
-    """
-    folder, by_geometry = fields.networks or networks.WEIGHTS, fields.naming == "geometry"
-    loaded = networks.load(folder, fields.threads, target.kind, by_geometry)
-    return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)

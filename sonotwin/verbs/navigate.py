@@ -38,7 +38,7 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
-from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.tracking.tracker import Tracker
 from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
 
