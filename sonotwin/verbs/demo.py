@@ -13,12 +13,11 @@ run that was interrupted is simply started again.
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
-from rich.console import Console
-
 from recon.files.metrics import Metrics, shown
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
 from sonotwin import demonstration, pipeline
+from sonotwin.console_watch import LineConsole
 from sonotwin.demonstration import Config
 from twin import board_session
 from twin.evaluation import sweep_errors
@@ -38,7 +37,7 @@ def run(config: Config) -> None:
         If a setting is wrong, the tracker's networks are missing, a step could not be done, or `out` or `board` holds something
         else.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
     parse_scene(config.scene)

@@ -10,7 +10,7 @@ import pytest
 
 from recon import user_cache
 from recon.errors import InputError
-from sonotwin import cli, verb_help
+from sonotwin import cli, console_watch, verb_help
 from tests.patience import PATIENCE_S
 
 VERBS = sorted(path.stem.replace("_", "-") for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
@@ -208,3 +208,38 @@ sys.exit(cli.main([]))
     said = running.communicate(timeout=PATIENCE_S)[1]
     assert running.returncode == status
     assert len(said.splitlines()) == 1 and list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_goes_away_ends_no_step(tmp_path):
+    """As in `sonotwin surface ... | head -1`: the result is written, and the status is that of a broken pipe."""
+    program = """
+import sys
+from pathlib import Path
+from sonotwin import cli
+from sonotwin.console_watch import ConsoleWatch
+
+def work(arguments):
+    for line in ("read", "decode", "wrote"):
+        ConsoleWatch().say(line)
+    Path("result").touch()
+
+cli._run = work
+sys.exit(cli.main([]))
+"""
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    env["PYTHONPATH"] = str(Path(cli.__file__).parents[1])
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=env, stdout=writing, stderr=subprocess.PIPE, check=False
+    )
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + cli.BROKEN_PIPE, b"")
+    assert (tmp_path / "result").exists()
+
+
+def test_lines_are_printed_as_they_are(capsys):
+    """Names of folders that are long, in brackets or between colons, too."""
+    line = f"wrote       {'long/' * 60}[bold]/:x:/12.5"
+    console_watch.ConsoleWatch().say(line)
+    assert capsys.readouterr().out == f"{line}\n"
