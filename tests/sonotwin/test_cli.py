@@ -76,9 +76,10 @@ def test_help_is_made_anew_after_a_change_and_where_nothing_can_be_kept(no_texts
     assert [verb_help.text("check", "") for _ in range(2)] == ["first", "first"]
     monkeypatch.setattr(verb_help, "_state", lambda: "another")
     assert [verb_help.text("check", "") for _ in range(2)] == ["second", "second"]
-    (no_texts / "check.txt").write_bytes(b"\xff")
-    assert verb_help.text("check", "") == "third" and [file.name for file in no_texts.iterdir()] == ["check.txt"]
-    (no_texts / "check.txt").unlink()
+    (kept,) = no_texts.iterdir()
+    kept.write_bytes(b"\xff")
+    assert verb_help.text("check", "") == "third" and [*no_texts.iterdir()] == [kept]
+    kept.unlink()
     no_texts.rmdir()
     no_texts.write_text("a file in its place")
     assert verb_help.text("check", "") == "fourth"
@@ -97,7 +98,19 @@ def test_the_state_is_that_of_all_sources(tmp_path, monkeypatch):
         states.append(verb_help._state())
     (tmp_path / "recon" / "__pycache__").mkdir()
     (tmp_path / "recon" / "__pycache__" / "a.py").write_text("")
+    (tmp_path / "sonotwin" / "conf" / "rig" / "gone.yaml").symlink_to(tmp_path / "nowhere.yaml")
     assert len(set(states)) == 4 and verb_help._state() == states[-1]
+    monkeypatch.setattr(verb_help, "version", lambda name: "another")
+    assert verb_help._state() not in states
+
+
+def test_two_clones_keep_a_text_each(no_texts, tmp_path, monkeypatch):
+    monkeypatch.setattr(verb_help, "make", lambda verb, module: verb_help.__file__)
+    here, made = verb_help.__file__, []
+    for place in (here, str(tmp_path / "clone" / "sonotwin" / "verb_help.py"), here):
+        monkeypatch.setattr(verb_help, "__file__", place)
+        made.append(verb_help.text("check", ""))
+    assert made[0] == made[2] != made[1] and len(list(no_texts.iterdir())) == 2
 
 
 def test_help_waits_for_no_library():
