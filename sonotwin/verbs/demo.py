@@ -14,6 +14,7 @@ run that was interrupted is simply started again.
 """
 
 from recon.files.metrics import Metrics, shown
+from recon.files.occupied import occupied
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
 from sonotwin import demonstration, pipeline
@@ -34,10 +35,14 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If a setting is wrong, the tracker's networks are missing, a step could not be done, or `out` or `board` holds something
-        else.
+        If a setting is wrong, the tracker's networks are missing, a step could not be done, `out` or `board` holds something
+        else, or another demonstration is at work in `out`.
     """
-    console = LineConsole()
+    with occupied(config.out):
+        _play(config, LineConsole())
+
+
+def _play(config: Config, console: LineConsole) -> None:
     if config.looks_inside or config.film_frames:
         networks.load()  # before minutes of work
     parse_scene(config.scene)
