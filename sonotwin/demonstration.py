@@ -14,6 +14,7 @@ from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.model.probe import Speed
+from recon.model.rig import Positive
 from recon.session import optics_step, plan, scene_step, skin_step
 from sonotwin import command_line, pipeline, rendered_session
 from sonotwin.config import defaults
@@ -22,6 +23,7 @@ from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, WIRES, Rendering
 from sonotwin.verbs import evaluate, film, reconstruct, render, track
 from twin import board_session
 from twin.evaluation import session_errors, sweep_errors, track_errors
+from twin.optics.light_transport import Samples
 from twin.optics.surface_session import CameraName
 from twin.reports import demo_report, sweep_report, track_report
 from twin.session import CAPTURE, TRUTH
@@ -64,6 +66,9 @@ class Config(rendered_session.Settings):
 
     cameras: Annotated[list[CameraName], Field(min_length=1, max_length=1)]
     board: Path
+    wires: Annotated[int, Field(ge=1, le=1000)] = 30
+    bottom_s: Positive = 4.0
+    board_samples: Samples | None = 8
     tissue_m_s: Speed = 1450.0
     film_frames: Annotated[int, Field(ge=0, le=10_000)] = 24
 

@@ -216,7 +216,7 @@ def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | 
 
 
 def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
-    """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
+    """Track the target in a sweep's frames; returns a capture in which it has poses, the sweep's own where it has a track."""
     settings, part, step = sources.settings, sources.sweeps[name], _step_of("poses", name)
     filmed = set(CAMERAS) <= part.images.keys()
     if part.track is not None and (optics is None or not filmed):
@@ -235,7 +235,7 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) 
 
 
 def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> KnownLag | None:
-    """The scanner's latency: the one given, or that of the last sweep over a flat bottom; None if that failed.
+    """Measure the scanner's latency by the last sweep over a flat bottom, or take the one given; None if that failed.
 
     Without either a lag of nothing, for which each step assumes 0 with a sigma of its own.
     """
@@ -261,7 +261,7 @@ def read_lag(folder: Path) -> KnownLag:
 
 
 def calibrate_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path | None], lag: KnownLag | None) -> Path | None:
-    """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
+    """Calibrate the probe by the last sweep over crossed wires, or take the one given, or the capture's; returns its file."""
     settings, name = sources.settings, _last(sources, "probe")
     if settings.probe is not None:
         return steps.take("probe", settings.probe, "as given")
