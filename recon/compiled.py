@@ -13,13 +13,12 @@ import hashlib
 import logging
 import os
 import pickle
-import shutil
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 import numba
@@ -33,7 +32,6 @@ NUMBA = "numba>=0.61,<0.69"  # whose undocumented parts are known to be as they 
 OURS = ("recon", "scenes", "twin", "trainers", "sonotwin", "benchmarks")  # packages; others keep Numba's own cache
 KERNEL: dict[str, Any] = {"noalias": True, "nogil": True, "_nrt": False, "error_model": "numpy"}  # options of kernels
 Name = tuple[str, ...]  # one with dots, in parts
-UNUSED_DAYS = 30  # after which code compiled from other sources is deleted
 
 
 def njit(function: Callable | None = None, noalias: bool = False, **options: Any) -> Any:
@@ -123,17 +121,25 @@ def _parsed(path: Path, _: int) -> _Text:
     source = path.read_bytes()
     stamp = hashlib.sha256(Path(__file__).read_bytes() + b"\0" + source).digest()
     kept = user_cache.compiled_code() / "texts" / hashlib.sha256(str(path).encode(errors="surrogateescape")).hexdigest()[:20]
-    with suppress(OSError, EOFError, pickle.UnpicklingError):
-        content = kept.read_bytes()
-        if content.startswith(stamp):
-            return pickle.loads(content[len(stamp) :])
+    with suppress(OSError):
+        first, digest, content = _split(kept.read_bytes(), len(stamp))
+        if first == stamp and digest == hashlib.sha256(content).digest():  # written by this very code, and whole
+            user_cache.note_use(kept)
+            return pickle.loads(content)
     text = _read(source)
+    content = pickle.dumps(text)
     with suppress(OSError):
         kept.parent.mkdir(parents=True, exist_ok=True)
-        temporary = kept.with_name(f".{kept.name}.{os.getpid()}")
-        temporary.write_bytes(stamp + pickle.dumps(text))
+        user_cache.remove_unused(kept.parent)
+        temporary = kept.with_name(f".{kept.name}.{os.getpid()}.{token_hex(4)}")  # of one process, on any machine
+        temporary.write_bytes(stamp + hashlib.sha256(content).digest() + content)
         temporary.replace(kept)
     return text
+
+
+def _split(content: bytes, length: int) -> tuple[bytes, bytes, bytes]:
+    """The two digests, of a length each, that a file begins with, and the rest."""
+    return content[:length], content[length : 2 * length], content[2 * length :]
 
 
 def _read(source: bytes) -> _Text:
@@ -252,11 +258,9 @@ def _folder(path: Path, root: Path, _: int) -> Path:
     folder = home / source_hash(path, root)
     try:
         if folder.is_dir():
-            os.utime(folder)
+            user_cache.note_use(folder)
         else:
-            for old in home.glob("*/"):
-                if time.time() - old.stat().st_mtime > UNUSED_DAYS * 86400:
-                    shutil.rmtree(old, ignore_errors=True)
+            user_cache.remove_unused(home)
     except OSError:  # someone else's cache, or someone else just deleted it
         pass
     return folder

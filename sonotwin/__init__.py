@@ -2,7 +2,7 @@
 
 The names of `__all__` and `__version__` are the interface; `docs/interface.md` documents each with an example. They are imported
 on first use, so `import sonotwin` is instant and needs none of the packages. Everything else is internal and may change between
-versions. The stub beside this file lists the names for this module and for editors and type checkers alike.
+versions. The stub beside this file lists the names for this module and for editors and type checkers alike, one a line.
 """
 
 import re
@@ -10,13 +10,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-_PLACES = {  # of the public names: module, and name in it
-    name: (module, there)
-    for module, there, name in re.findall(
-        r"^from (\S+) import (\w+) as (\w+)$", Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"), re.MULTILINE
-    )
-}
 
+def _read_places(stub: Path) -> dict[str, tuple[str, str]]:
+    """Places of the public names, as the stub lists them: name -> module, and name in it; ImportError where it has others."""
+    lines = [line for line in stub.read_text(encoding="utf-8").splitlines() if line.startswith(("from ", "import "))]
+    matches = [re.fullmatch(r"from (\S+) import (\w+) as (\w+)", line) for line in lines]
+    if not lines or None in matches:
+        found = lines[matches.index(None)] if lines else "none"
+        raise ImportError(f"{stub}: expected lines such as 'from recon.errors import InputError as InputError', found {found}")
+    return {match[3]: (match[1], match[2]) for match in matches if match is not None}
+
+
+_PLACES = _read_places(Path(__file__).with_suffix(".pyi"))
 __all__ = sorted(_PLACES)
 
 

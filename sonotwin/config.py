@@ -214,6 +214,7 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
     with TemporaryDirectory() if files else nullcontext("") as own:
         named = [_named(Path(own), k, files[k]) if k in files else override for k, override in enumerate(overrides)]
         quoted = [_literal_if_not_grammar(verb, override) for override in named if override not in plain]
+        quoted = [override for override in quoted if not _is_usual_null(verb, override, quoted)]
         for override in quoted:
             _check_choice(verb, override)
         chosen = [override for override in quoted if _group(override) in groups(verb)]
@@ -391,6 +392,13 @@ def _named(place: Path, number: int, choice: tuple[str, Path]) -> str:
     (place / group).mkdir(exist_ok=True)
     shutil.copyfile(path, place / group / f"{name}.yaml")
     return f"{key}={name}"
+
+
+def _is_usual_null(verb: str, override: str, others: Sequence[str]) -> bool:
+    """Whether an override gives null, at which Hydra fails, to a group without any other choice, of which it is the usual one."""
+    group, _, value = override.partition("=")
+    alone = all(other == override for other in others if _group(other) == group)
+    return value == "null" and alone and {group: None} in primary(verb).get("defaults", [])
 
 
 def _check_choice(verb: str, override: str) -> None:

@@ -1,4 +1,4 @@
-"""A step's lines and its progress on the console."""
+"""The console of verbs, and a step's lines and progress on it."""
 
 import sys
 from collections.abc import Iterable, Iterator
@@ -10,11 +10,25 @@ from rich.progress import Progress
 from recon.session.watch import Thing, Watch
 
 
+class LineConsole(Console):
+    """Prints lines as they are. It falls silent when its reader goes away, such as `head`, and the work goes on.
+
+    What couldn't be written stays in the buffer of stdout, so that the command's last flush finds the broken pipe for its status.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(soft_wrap=True, highlight=False, emoji=False)
+
+    def on_broken_pipe(self) -> None:
+        """Say nothing more, in place of ending the process."""
+        self.quiet = True
+
+
 class ConsoleWatch(Watch):
     """Shows the lines as they are; progress, on a terminal, for as long as the work takes."""
 
     def __init__(self) -> None:
-        self.console = Console(soft_wrap=True, highlight=False)
+        self.console = LineConsole()
 
     def say(self, line: str) -> None:
         """Print a line."""

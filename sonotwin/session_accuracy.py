@@ -123,7 +123,7 @@ def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int
     for part in rendered_session.cylinders(chosen, work / "session"):
         part.run()
     truth = (work / "session" / "truth").rename(work / "truth")
-    lag = plan.measured_lag(by.out / "latency")
+    lag = plan.read_lag(by.out / "latency")
     in_tank = reconstruct.Config(
         rig=chosen.rig,
         capture=work / "session" / "capture",

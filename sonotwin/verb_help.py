@@ -1,7 +1,7 @@
 """The text of `sonotwin VERB --help`: its docstring, fields with defaults, units and texts, and choices.
 
 Fields are those of the verb's `Config`, which takes seconds to import with all that the verb calculates with. So the text is kept
-beside the compiled code, by the state of all source files, and comes at once the next time.
+beside the compiled code, by the state of all source files of this installation, and comes at once the next time.
 """
 
 import ast
@@ -9,13 +9,16 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
+from secrets import token_hex
 
 from recon import user_cache
 from recon.errors import InputError
 
 PACKAGES = ("recon", "scenes", "twin", "trainers", "sonotwin", "conf")  # whose files a text may depend on
+LIBRARIES = ("pydantic", "hydra-core", "omegaconf")  # whose versions it may depend on, too
 
 
 def text(verb: str, module: str) -> str:
@@ -26,10 +29,12 @@ def text(verb: str, module: str) -> str:
     InputError
         If the installation lacks the module.
     """
-    place, state = user_cache.help_texts() / f"{verb}.txt", _state()
+    root = hashlib.sha256(os.fsencode(Path(__file__).resolve().parent)).hexdigest()[:8]  # another clone's text is another file
+    place, state = user_cache.help_texts() / f"{verb}.{root}.txt", _state()
     try:
         first, _, kept = place.read_text(encoding="utf-8").partition("\n")
         if first == state:
+            user_cache.note_use(place)
             return kept
     except (OSError, ValueError):
         pass  # none yet
@@ -62,9 +67,10 @@ def make(verb: str, module: str) -> str:
 
 def _keep(place: Path, content: str) -> None:
     """Write a file as a whole; a cache that can't be written is none."""
-    temporary = place.with_name(f".{place.stem}.{os.getpid()}")
+    temporary = place.with_name(f".{place.stem}.{os.getpid()}.{token_hex(4)}")
     with suppress(OSError):
         place.parent.mkdir(parents=True, exist_ok=True)
+        user_cache.remove_unused(place.parent)
         temporary.write_text(content, encoding="utf-8")
         temporary.replace(place)
 
@@ -72,6 +78,9 @@ def _keep(place: Path, content: str) -> None:
 def _state() -> str:
     """Digest of names, sizes and times of all files that a text may depend on; to read them would take as long as the imports."""
     root, found = Path(__file__).resolve().parent, hashlib.sha256()
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found.update(f"{name} {version(name)}\n".encode())
     for package in PACKAGES:
         for folder in (root.parent / package, root / package):  # conf is beside the package in a clone, inside it in a wheel
             for line in sorted(_files(folder)):
@@ -87,8 +96,9 @@ def _files(folder: Path) -> Iterator[str]:
     for entry in entries:
         if entry.name.startswith((".", "__pycache__")):
             continue
-        if entry.is_dir():
-            yield from _files(Path(entry.path))
-        elif entry.name.endswith((".py", ".yaml")):
-            about = entry.stat()
-            yield f"{entry.path} {about.st_size} {about.st_mtime_ns}\n"
+        with suppress(OSError):  # a link to nothing, or a file that was deleted meanwhile
+            if entry.is_dir():
+                yield from _files(Path(entry.path))
+            elif entry.name.endswith((".py", ".yaml")):
+                about = entry.stat()
+                yield f"{entry.path} {about.st_size} {about.st_mtime_ns}\n"

@@ -2,6 +2,7 @@
 
 import html
 import json
+import os
 import re
 import shlex
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from recon.capture import manifest
 from recon.errors import InputError
 from recon.files import atomic
+from recon.files.occupied import occupied
 from recon.tracking import networks
 from sonotwin import demonstration, pipeline, rendered_session
 from sonotwin.cli import main
@@ -270,7 +272,7 @@ def test_what_is_left_out_is_said():
 
 
 def test_missing_networks_are_told_before_any_work(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(networks.load, "__defaults__", (tmp_path, 0))
+    monkeypatch.setattr(networks.load, "__defaults__", (tmp_path, *networks.load.__defaults__[1:]))
     assert main(["demo", f"out={tmp_path / 'demo'}"]) == 2
     assert "detector.onnx: expected a network, found none" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
@@ -288,6 +290,16 @@ def test_two_scanners_are_refused_before_any_work(tmp_path, capsys):
     assert main(["demo", "ultrasound.image_size=[161,272]", f"out={tmp_path / 'demo'}"]) != 0
     assert "ultrasound.image_size: expected rig.probe's [321, 408]" in capsys.readouterr().err
     assert not (tmp_path / "demo").exists()
+
+
+def test_a_second_demonstration_into_the_folder_is_refused_at_once(tmp_path, capsys):
+    """It would empty the capture of the first one."""
+    out = tmp_path / "out"
+    with occupied(out):
+        assert main(["demo", f"out={out}", f"board={tmp_path / 'board'}", *SMALL]) == 2
+    said = capsys.readouterr().err
+    assert f"found process {os.getpid()} on " in said and said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_of_others_is_no_place_for_the_board(tmp_path, capsys):

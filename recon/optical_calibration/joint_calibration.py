@@ -188,9 +188,10 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     bare = replace(estimate, cameras={name: replace(each, distortion=np.zeros(0)) for name, each in estimate.cameras.items()})
     adjusted = adjust(observations, bare, free, offsets, tolerances, released)
     offsets = circle_offsets(observations, adjusted.estimate, board)
+    problem = replace(adjusted.problem, offsets=offsets)  # of the next adjustment, by which the evidence is weighed
     if released:
-        tolerances = _tolerances(adjusted, settings.shape)
-    lenses = _lenses(adjusted)
+        tolerances = _tolerances(replace(adjusted, problem=problem), settings.shape)
+    lenses = _lenses(replace(adjusted, problem=replace(problem, tolerances=tolerances)))
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
     agreement = consistency(adjusted)
     if not np.isfinite(agreement.covariance).all():

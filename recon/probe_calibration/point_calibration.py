@@ -437,6 +437,7 @@ def _squared_as_predicted(estimate: _Estimate, sightings: Sightings, noise: Nois
     """Squared normalised residuals : (n,), of frames that weren't used by the uncertainty of the estimate too.
 
     Without it, six frames that twelve unknowns fit well would make outliers of all others, good ones too.
+    What the used frames leave open varies widely: frames that it explains are no outliers, and may be those that determine it.
     """
     slopes, residuals = _whitened(estimate, sightings, noise)
     covariance = np.broadcast_to(np.eye(3), (len(slopes), 3, 3)).copy()

@@ -60,7 +60,7 @@ class Optics:
     figures: Metrics
 
 
-def run(settings: Settings, out: Path, watch: Watch = SILENT, command: str = "") -> None:
+def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> None:
     """Find the board in all poses, adjust, judge and write.
 
     Parameters

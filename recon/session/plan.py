@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import model_validator
 
@@ -12,8 +12,8 @@ from recon.capture import calibration_files, lag_files, manifest, probe_files, t
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import Implausible, InputError
 from recon.files import atomic, metrics
-from recon.freehand.scans import ScansFields, TissueFields
-from recon.model.rig import Finite, NotNegative, Positive, Probe, Rig
+from recon.freehand.scans import TissueFields
+from recon.model.rig import Finite, NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
@@ -28,8 +28,9 @@ from recon.session import (
     store,
     volume_step,
 )
-from recon.session.settings import EchoFields, ScaleFields, TargetField, TrackingFields
+from recon.session.settings import EchoFields, ScaleFields, Spacing, TargetField
 from recon.session.store import Store, files_of
+from recon.session.tracker_settings import TrackingFields
 from recon.session.watch import SILENT, Watch
 from recon.tracking import networks
 from recon.tracking.results import POSES
@@ -62,8 +63,8 @@ class Settings(EchoFields, TissueFields, TargetField, TrackingFields, ScaleField
     by light that make no scene"""
     temperature_c: Finite | None = None
     """deg C, of the water about the wires; null leaves depths right for that water. Needed of another scanner"""
-    spacing_mm: Positive = 0.5
-    """mm, of a volume's voxels"""
+    spacing_mm: Spacing = 0.5
+    """mm, of a volume's voxels; 0.01 to 100"""
     find: Literal["masses", "tube", "nothing"] = "masses"
     """in the B-scans: masses, darker than the tissue around them; tube, round, in water, and the body about it; nothing"""
     overlays: bool = False
@@ -76,7 +77,7 @@ class Settings(EchoFields, TissueFields, TargetField, TrackingFields, ScaleField
         return self
 
 
-class Lag(NamedTuple):
+class KnownLag(NamedTuple):
     """The lag of the scanner's images behind the poses; nothing where it is assumed, as each step assumes it with its sigma."""
 
     lag_s: float | None = None
@@ -107,7 +108,7 @@ class Sources:
         return {"files": files_of(folders), "parts": described, "devices": self.held.model_dump(mode="json")["devices"]}
 
 
-def run(settings: Settings, out: Path, code: str, usual: Probe, watch: Watch = SILENT, command: Command | None = None) -> Store:
+def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command, watch: Watch = SILENT) -> Store:
     """Do all steps that the capture allows; returns what was done, and what could not be.
 
     Parameters
@@ -121,16 +122,16 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, watch: Watch = S
     InputError
         If the manifest is wrong, a given file is missing, or `out` can't be written to.
     """
-    sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command or (lambda *_: ""))
+    sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command)
     steps = Store(out, watch.announce, code)
     given = [path for path in (settings.calibration, settings.target, settings.probe, settings.networks) if path is not None]
     check(sources)
     with steps.opened([settings.capture, *given]):
-        optics = calibrated_optics(steps, sources)
-        skin = measured_skin(steps, sources, optics)
-        tracked = {name: tracked_sweep(steps, sources, name, optics) for name in sources.sweeps}
-        lag = measured_latency(steps, sources, tracked)
-        probe = calibrated_probe(steps, sources, tracked, lag)
+        optics = calibrate_optics(steps, sources)
+        skin = measure_skin(steps, sources, optics)
+        tracked = {name: track_sweep(steps, sources, name, optics) for name in sources.sweeps}
+        lag = measure_latency(steps, sources, tracked)
+        probe = calibrate_probe(steps, sources, tracked, lag)
         for name, part in sources.sweeps.items():
             if part.purpose in (None, "volume") and SCANNER in part.images:
                 look_inside(steps, sources, name, tracked[name], probe, lag, skin, optics)
@@ -175,8 +176,8 @@ def check(sources: Sources) -> None:
         sound_in_water.speed_of_sound(settings.temperature_c)
 
 
-def calibrated_optics(steps: Store, sources: Sources) -> Path | None:
-    """The calibration of cameras and projector: the one given, the board's, or the capture's own."""
+def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
+    """Calibrate cameras and projector by the board, or take the calibration given, or the capture's own; returns its file."""
     settings, held = sources.settings, sources.held
     own = None if held.calibration is None else settings.capture / held.calibration
     if settings.calibration is not None:
@@ -186,34 +187,37 @@ def calibrated_optics(steps: Store, sources: Sources) -> Path | None:
     if held.board.patterns is None and held.surface is not None and own is not None:
         steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
         return own
-    own_settings = optics_step.Settings(capture=settings.capture)
 
-    def work(out: Path) -> None:
-        optics_step.run(own_settings, out, sources.watch, sources.command(own_settings, out))
+    def work(by_board: optics_step.Settings, out: Path) -> None:
+        optics_step.run(by_board, out, sources.command(by_board, out), sources.watch)
 
-    does, files = "cameras and projector, from the board", (optics_step.OPTICS, optics_step.PAGE)
-    made = steps.do("optics", does, optics_step.BY, own_settings, work, files, sources.files("board"))
+    does, fields = "cameras and projector, from the board", {"capture": settings.capture}
+    files = (optics_step.OPTICS, optics_step.PAGE)
+    made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, files, sources.files("board"))
     return None if made is None else made / optics_step.OPTICS
 
 
-def measured_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
-    """The surface by light."""
+def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
+    """Measure the surface by light; returns its file."""
     settings = sources.settings
     if sources.held.surface is None:
         return None
     if optics is None:
         return steps.leave_out("surface", _no(steps, "optics", NO_OPTICS))
-    by_light = skin_step.Settings(
-        capture=settings.capture, calibration=optics, camera=settings.camera, implausible=settings.implausible
-    )
+    fields = {
+        "capture": settings.capture,
+        "calibration": optics,
+        "camera": settings.camera,
+        "implausible": settings.implausible,
+    }
     made_of, files = sources.files("surface") | _known_by(steps, "optics", optics), (skin_step.POINTS, skin_step.SKIN)
-    work = partial(skin_step.run, by_light, watch=sources.watch)
-    made = steps.do("surface", "the surface, from fringes", skin_step.BY, by_light, work, files, made_of)
+    does, work = "the surface, from fringes", partial(skin_step.run, watch=sources.watch)
+    made = steps.do("surface", does, skin_step.BY, skin_step.Settings, fields, work, files, made_of)
     return None if made is None else made / skin_step.SKIN
 
 
-def tracked_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
-    """A capture in which the sweep has poses: made of the cameras' frames, or the capture itself, where it has a track."""
+def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
+    """Track the target in a sweep's frames; returns a capture in which it has poses, the sweep's own where it has a track."""
     settings, part, step = sources.settings, sources.sweeps[name], _step_of("poses", name)
     filmed = set(CAMERAS) <= part.images.keys()
     if part.track is not None and (optics is None or not filmed):
@@ -222,50 +226,43 @@ def tracked_sweep(steps: Store, sources: Sources, name: str, optics: Path | None
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
-    tracking = poses_step.Settings(
-        rig=settings.rig,
-        capture=settings.capture,
-        sweep=name,
-        calibration=optics,
-        naming=settings.naming,
-        drift_px=settings.drift_px,
-        board_scale=settings.board_scale,
-        target=settings.target,
-        networks=settings.networks,
-        overlays=settings.overlays,
-    )
+    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
+    fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
     weights = settings.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
     files = (POSES, MANIFEST) if SCANNER in part.images else (POSES,)
-    work = partial(poses_step.run, tracking, watch=sources.watch)
-    return steps.do(step, "poses of the probe, from frames", poses_step.BY, tracking, work, files, made_of)
+    does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
+    return steps.do(step, does, poses_step.BY, poses_step.Settings, fields, work, files, made_of)
 
 
-def measured_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> Lag | None:
-    """The scanner's latency: the one given, that of the last sweep over a flat bottom, or 0 without one; None if it failed."""
+def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> KnownLag | None:
+    """Measure the scanner's latency by the last sweep over a flat bottom, or take the one given; None if that failed.
+
+    Without either a lag of nothing, for which each step assumes 0 with a sigma of its own.
+    """
     settings, name = sources.settings, _last(sources, "latency")
     if settings.lag_s is not None:
-        return Lag(settings.lag_s, settings.lag_sigma_s)
+        return KnownLag(settings.lag_s, settings.lag_sigma_s)
     if name is None:
         steps.leave_out("latency", "no sweep over a flat bottom and no lag_s; the B-scans' time stamps are taken as they are")
-        return Lag()
+        return KnownLag()
     if tracked[name] is None:
         return steps.fail("latency", f"no poses of the sweep {name}")
-    over_bottom = latency_step.Settings(capture=tracked[name], sweep=name, implausible=settings.implausible)
+    fields = {"capture": tracked[name], "sweep": name, "implausible": settings.implausible}
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
-    work = partial(latency_step.run, over_bottom, watch=sources.watch)
-    made = steps.do("latency", does, latency_step.BY, over_bottom, work, (latency_step.LAG,), made_of)
-    return None if made is None else measured_lag(made)
+    work = partial(latency_step.run, watch=sources.watch)
+    made = steps.do("latency", does, latency_step.BY, latency_step.Settings, fields, work, (latency_step.LAG,), made_of)
+    return None if made is None else read_lag(made)
 
 
-def measured_lag(folder: Path) -> Lag:
+def read_lag(folder: Path) -> KnownLag:
     """The lag that `sonotwin measure-lag` wrote into a folder; InputError as of `recon.capture.lag_files.read`."""
     found = lag_files.read(folder / lag_files.FILE)
-    return Lag(found.lag_s, found.sigma_s)
+    return KnownLag(found.lag_s, found.sigma_s)
 
 
-def calibrated_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path | None], lag: Lag | None) -> Path | None:
-    """The probe's calibration: the one given, that of the last sweep over crossed wires, or without one the capture's."""
+def calibrate_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path | None], lag: KnownLag | None) -> Path | None:
+    """Calibrate the probe by the last sweep over crossed wires, or take the one given, or the capture's; returns its file."""
     settings, name = sources.settings, _last(sources, "probe")
     if settings.probe is not None:
         return steps.take("probe", settings.probe, "as given")
@@ -273,18 +270,11 @@ def calibrated_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path 
         return None if sources.held.probe is None else _own_probe(steps, settings, settings.capture / sources.held.probe)
     if tracked[name] is None or lag is None:
         return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
-    over_wires = probe_step.Settings(
-        rig=settings.rig,
-        capture=tracked[name],
-        sweep=name,
-        lag_s=lag.lag_s or 0.0,
-        implausible=settings.implausible,
-        temperature_c=settings.temperature_c,
-        scale_given=settings.scale_given,
-    )
+    fields = {field: getattr(settings, field) for field in ("rig", "implausible", "temperature_c", "scale_given")}
+    fields |= {"capture": tracked[name], "sweep": name, "lag_s": lag.lag_s or 0.0}
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
-    work = partial(probe_step.run, over_wires, usual=sources.usual, watch=sources.watch)
-    made = steps.do("probe", does, probe_step.BY, over_wires, work, (probe_step.PROBE, probe_step.FRAMES), made_of)
+    files, work = (probe_step.PROBE, probe_step.FRAMES), partial(probe_step.run, usual=sources.usual, watch=sources.watch)
+    made = steps.do("probe", does, probe_step.BY, probe_step.Settings, fields, work, files, made_of)
     return None if made is None else made / probe_step.PROBE
 
 
@@ -300,11 +290,11 @@ def look_inside(
     name: str,
     capture: Path | None,
     probe: Path | None,
-    lag: Lag | None,
+    lag: KnownLag | None,
     skin: Path | None,
     optics: Path | None,
 ) -> None:
-    """The volume of a sweep, and what is found in its B-scans."""
+    """Make the volume of a sweep, and look for masses or a tube in its B-scans."""
     settings, volume = sources.settings, _step_of("volume", name)
     if capture is None or lag is None or probe is None:
         no_poses = f"no poses of the sweep {name}".rstrip()
@@ -313,61 +303,41 @@ def look_inside(
         for kind in wanted:
             steps.leave_out(_step_of(kind, name), reason)
         return None
-    placed = ScansFields(
-        capture=capture,
-        sweep=name,
-        probe=probe,
-        lag_s=lag.lag_s,
-        lag_sigma_s=lag.sigma_s,
-        tissue_m_s=settings.tissue_m_s,
-        tissue_sigma_m_s=settings.tissue_sigma_m_s,
-        implausible=settings.implausible,
-    )
-    compounding = volume_step.Settings(**dict(placed), spacing_mm=settings.spacing_mm)
+    seen = {"capture": capture, "sweep": name, "probe": probe, "implausible": settings.implausible}
+    placed = seen | {field: getattr(settings, field) for field in ("tissue_m_s", "tissue_sigma_m_s")}
+    placed |= {"lag_s": lag.lag_s, "lag_sigma_s": lag.sigma_s}
+    does, fields = "B-scans in a volume", placed | {"spacing_mm": settings.spacing_mm}
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
-    work = partial(volume_step.run, compounding, watch=sources.watch)
-    voxels = steps.do(volume, "B-scans in a volume", volume_step.BY, compounding, work, (volume_step.VOLUME,), made_of)
+    files, work = (volume_step.VOLUME,), partial(volume_step.run, watch=sources.watch)
+    voxels = steps.do(volume, does, volume_step.BY, volume_step.Settings, fields, work, files, made_of)
     if settings.find == "nothing":
         return None
     if skin is not None:
         made_of |= {"skin": steps.digest("surface")}
     does, found = f"{'masses' if settings.find == 'masses' else 'a tube'} in the B-scans", _step_of(settings.find, name)
-    sought = masses_step.Settings(
-        **dict(placed), surface=skin, kind=settings.find, spread_mm=settings.spread_mm, slice_mm=settings.slice_mm
-    )
-    work = partial(masses_step.run, sought, watch=sources.watch)
-    masses = steps.do(found, does, masses_step.BY, sought, work, (), made_of)
+    fields = placed | {"surface": skin, "kind": settings.find, "spread_mm": settings.spread_mm, "slice_mm": settings.slice_mm}
+    work = partial(masses_step.run, watch=sources.watch)
+    masses = steps.do(found, does, masses_step.BY, masses_step.Settings, fields, work, (), made_of)
     if settings.find == "masses":
-        shown = shown_together(settings, placed, skin, optics, masses, voxels)
+        fields = seen | show_together(settings, lag, skin, optics, masses, voxels)
         made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics"), "volume": steps.digest(volume)}
-        work = partial(scene_step.run, shown, watch=sources.watch)
-        steps.do(_step_of("scene", name), "all of it in one picture", scene_step.BY, shown, work, (scene_step.SCENE,), made_of)
+        does, work = "all of it in one picture", partial(scene_step.run, watch=sources.watch)
+        shown, files = _step_of("scene", name), (scene_step.SCENE,)
+        steps.do(shown, does, scene_step.BY, scene_step.Settings, fields, work, files, made_of)
     return None
 
 
-def shown_together(
+def show_together(
     settings: Settings,
-    placed: ScansFields,
+    lag: KnownLag,
     skin: Path | None,
     optics: Path | None,
     masses: Path | None,
     volume: Path | None,
-) -> scene_step.Settings:
-    """Settings by which all that was found about a sweep is put into one picture."""
-    assert placed.capture is not None
-    return scene_step.Settings(
-        rig=settings.rig,
-        capture=placed.capture,
-        sweep=placed.sweep,
-        implausible=placed.implausible,
-        probe=placed.probe,
-        lag_s=placed.lag,
-        tissue_m_s=placed.tissue_m_s,
-        surface=skin,
-        masses=masses,
-        volume=volume,
-        calibration=optics,
-    )
+) -> dict[str, Any]:
+    """Fields of a scene by which all that was found about a sweep is put into one picture."""
+    own = {"rig": settings.rig, "tissue_m_s": settings.tissue_m_s, "lag_s": lag.lag_s or 0.0}
+    return own | {"surface": skin, "masses": masses, "volume": volume, "calibration": optics}
 
 
 def kept_scene(settings: Settings, out: Path, sweep: str, optics: Path | None) -> scene_step.Settings:
@@ -380,18 +350,11 @@ def kept_scene(settings: Settings, out: Path, sweep: str, optics: Path | None) -
     InputError
         If the folder has no lag.
     """
-    lag = measured_lag(out / "latency")
-    placed = ScansFields(
-        capture=out / "poses" / sweep,
-        sweep=sweep,
-        probe=out / "probe" / probe_step.PROBE,
-        lag_s=lag.lag_s,
-        lag_sigma_s=lag.sigma_s,
-        tissue_m_s=settings.tissue_m_s,
-        implausible=settings.implausible,
-    )
-    skin = out / "surface" / skin_step.SKIN
-    return shown_together(settings, placed, skin, optics, out / "masses" / sweep, out / "volume" / sweep)
+    lag, skin = read_lag(out / "latency"), out / "surface" / skin_step.SKIN
+    shown = show_together(settings, lag, skin, optics, out / "masses" / sweep, out / "volume" / sweep)
+    probe = out / "probe" / probe_step.PROBE
+    seen = {"capture": out / "poses" / sweep, "sweep": sweep, "probe": probe, "implausible": settings.implausible}
+    return scene_step.Settings.model_validate(seen | shown)
 
 
 def figures(out: Path, steps: Store) -> metrics.Metrics:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from recon.capture import stereo_frames
 from recon.capture.stereo_frames import Film, Pair
 from recon.files import atomic, metrics
-from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.session.watch import SILENT, Watch
 from recon.tracking import results, track_figures
 from recon.tracking.results import Step
@@ -31,7 +31,7 @@ class Settings(MeasuredTargetFields):
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> list[Step]:
-    """Read, track and write.
+    """Read, track and write; returns a step for each pair of frames, with its pose, or the reason why there is none.
 
     Raises
     ------

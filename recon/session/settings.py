@@ -2,61 +2,18 @@
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
-from recon.capture import target_files
-from recon.geometry.camera import Camera
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
-from recon.model.rig import NotNegative, Part, Probe, Rig, Target
-from recon.registry import Choice
+from recon.model.rig import NotNegative, Part, Probe
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
-from recon.tracking import networks
-from recon.tracking.networks import OnnxNetworks
-from recon.tracking.tracker import Tracker
 
 Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
+Spacing = Annotated[float, Field(ge=0.01, le=100)]  # mm, of a volume's voxels
 OF_THE_SCALE = "rig.probe.scale_mm_per_px"
-
-
-class NetworkFields(Part):
-    """Fields of a step that looks for the target by networks."""
-
-    networks: Path | None = None
-    """folder of detector.onnx and segmenter.onnx; null for those that come with sonotwin"""
-    naming: Literal["networks", "geometry"] = "networks"
-    """by which a circle gets its name: networks that were trained for this kind of target; or its place among the others alone,
-    with any networks: slower, and of covered circles fewer are found"""
-
-    def load_networks(self, kind: str, threads: int) -> OnnxNetworks:
-        """The networks for a kind of target; InputError as of `recon.tracking.networks.load`."""
-        way = f"train it with a data set of {kind}, or give naming=geometry: circles' names by their places alone"
-        return networks.load(self.networks or networks.WEIGHTS, threads, kind, self.naming == "geometry", way)
-
-
-class TrackingFields(NetworkFields):
-    """Fields of a step that tracks the target by cameras some time after their calibration."""
-
-    drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
-    """px, standard deviation of principal points since the calibration: warmth, a turned mount; focal lengths by 4e-4 of it,
-    relative"""
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
-    less: of paper by moisture; 1e-5 of chrome on glass"""
-
-
-class TrackerFields(TrackingFields):
-    """Fields of a step that tracks the target by a tracker of its own."""
-
-    rig: Annotated[Rig, Choice("meza2021")]
-    """of it, the target's design: distances and diameters of its circles, and their tolerance"""
-    calibration: Path | None = None
-    """file of the devices' calibration, used instead of the capture's own"""
-    threads: Annotated[int, Field(ge=0, le=1024)] = 0
-    """cores for the networks, 0 for all; another number may change last digits"""
 
 
 class TargetField(Part):
@@ -64,10 +21,6 @@ class TargetField(Part):
 
     target: Path | None = None
     """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
-
-
-class MeasuredTargetFields(TargetField, TrackerFields):
-    """Fields of a step that tracks the target as it was measured, by a tracker of its own."""
 
 
 def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
@@ -114,28 +67,3 @@ class ScaleFields(Part):
         if self.scale_given or given.scale_mm_per_px != usual.scale_mm_per_px:
             return given.scale_mm_per_px[1]
         return None if given.image_size == usual.image_size else np.nan
-
-
-def target_of(fields: MeasuredTargetFields) -> Target:
-    """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
-    design = fields.rig.target
-    return design if fields.target is None else target_files.read(fields.target, design)
-
-
-def make_tracker(
-    fields: TrackerFields, target: Target, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
-) -> Tracker:
-    """The tracker of a target, by cameras some time after their calibration.
-
-    Parameters
-    ----------
-    known : of the cameras' calibration; None where it has none
-    bits : of frames deeper than 8 bits; None of others
-
-    Raises
-    ------
-    InputError
-        If a network is missing, isn't one, or is of another kind of target.
-    """
-    loaded = fields.load_networks(target.kind, fields.threads)
-    return Tracker(cameras, target, loaded, bits, known, fields.drift_px, fields.board_scale)

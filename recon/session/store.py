@@ -11,14 +11,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from recon.errors import InputError
+from recon.errors import InputError, validated
 from recon.files import atomic, json_text, metrics
 
 RECORD = "reconstruct.json"
 BY = "reconstruct"  # who writes
+Settings = TypeVar("Settings", bound=BaseModel)
 
 
 @dataclass
@@ -63,8 +65,9 @@ class Store:
         name: str,
         does: str,
         by: str,
-        settings: BaseModel,
-        work: Callable[[Path], object],
+        model: type[Settings],
+        fields: Mapping[str, Any],
+        work: Callable[[Settings, Path], object],
         files: Sequence[str],
         made_of: Mapping[str, object],
     ) -> Path | None:
@@ -74,21 +77,23 @@ class Store:
         ----------
         name : of the step, and of its folder
         does : for people
-        by, settings : name of the verb that does the same, and what the step is made by
-        work : does the step, and writes its folder, whole or not at all
+        by : name of the verb that does the same
+        model, fields : of the step's settings; fields that the model refuses fail this step alone
+        work : does the step by its settings, and writes its folder, whole or not at all
         files : that the step hands on; all must be there for it to be kept
         made_of : inputs beside the settings: digests of files and of earlier steps
         """
         place = self.folder / name
-        digest = digest_of([self.code, by, settings.model_dump(mode="json"), made_of])
-        if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
-            self.say(f"kept        {name}: {does}, as before")
-            self.done.append(name)
-            return place
-        self.say(f"{name}: {does}")
-        self._change(name, None)
         try:
-            work(place)
+            settings = validated(model, fields, by)
+            digest = digest_of([self.code, by, settings.model_dump(mode="json"), made_of])
+            if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
+                self.say(f"kept        {name}: {does}, as before")
+                self.done.append(name)
+                return place
+            self.say(f"{name}: {does}")
+            self._change(name, None)
+            work(settings, place)
         except InputError as error:
             self.fail(name, str(error))
             return None

@@ -9,7 +9,7 @@ from recon.capture import stereo_frames, target_files
 from recon.capture.stereo_frames import Film
 from recon.files import atomic, metrics
 from recon.session import poses_step
-from recon.session.settings import TrackerFields, make_tracker
+from recon.session.tracker_settings import TrackerFields, make_tracker
 from recon.session.watch import SILENT, Watch
 from recon.target_calibration import target_bundle, target_figures, target_poses
 from recon.target_calibration.target_bundle import Adjusted

@@ -24,6 +24,7 @@ from recon.freehand.scans import Extent, Scans, ScansFields, VolumeSettings
 from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Compounding, Interpolation, Reconstruction, Rectangle
 from recon.model.fan import Fan, Sector
+from recon.session.settings import Spacing
 from recon.session.watch import SILENT, Watch
 
 BY = "freehand"  # who writes
@@ -35,7 +36,7 @@ SIGMA, SEQUENCE = "sigma.nrrd", "sequence.igs.mha"
 class Settings(ScansFields):
     """Sources, and settings of the volume."""
 
-    spacing_mm: Annotated[float, Field(ge=0.01, le=100)] | None = None
+    spacing_mm: Spacing | None = None
     """0.5 mm, of the voxels; 0.01 to 100"""
     extent: Extent | None = None
     """principal: along the axes of the sweep, smaller if it runs across; aligned: along the world's, as in PLUS"""

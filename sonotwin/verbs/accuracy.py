@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import yaml
-from rich.console import Console
 
 from recon.capture.surface_part import read_patterns
 from recon.errors import InputError
 from recon.model.rig import Part, Rig
 from sonotwin.config import folder
+from sonotwin.console_watch import LineConsole
 from twin.conditions import Conditions
 from twin.engine import Engine
 from twin.experiments import bars, document_tables, result_rows
@@ -67,7 +67,7 @@ def run(config: Config) -> int:
     kept = Kept(config.out / "kept", State(*document_tables.state((config.document or folder()).parent)))
     kept.open()
     setup = setup_of(config.rig, config.real, config.out)
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     met = True
     for group in groups:
         measured = []

@@ -30,7 +30,7 @@ class Config(optics_step.Settings):
 
 def run(config: Config) -> None:
     """Find the board in all poses, adjust, judge and write; raises InputError as `recon.session.optics_step.run`."""
-    optics_step.run(config, config.out, ConsoleWatch(), command(config))
+    optics_step.run(config, config.out, command(config), ConsoleWatch())
 
 
 def command(config: Config) -> str:

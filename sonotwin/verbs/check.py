@@ -31,7 +31,7 @@ from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR, Matches
 from recon.rig_check.verdicts import Optics, Verdict
 from recon.session import poses_step
-from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
 from recon.tracking import track_figures

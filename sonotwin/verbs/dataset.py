@@ -23,6 +23,7 @@ from rich.progress import Progress
 
 from recon.files.occupied import occupied
 from recon.model.rig import Rig
+from sonotwin.console_watch import LineConsole
 from twin.engine import Engine
 from twin.shooting import Quality
 from twin.tracking.dataset_shards import Place, Settings, generate, prepare, write_index
@@ -59,7 +60,7 @@ def run(config: Config) -> None:
         If `out` holds anything but a data set of these settings, or another run is writing there.
     """
     with occupied(config.out):
-        _make(config, Console(soft_wrap=True, highlight=False))
+        _make(config, LineConsole())
 
 
 def _make(config: Config, console: Console) -> None:

@@ -13,12 +13,12 @@ run that was interrupted is simply started again.
     sonotwin demo scene=sphere patterns=gray_surface out=outputs/sphere
 """
 
-from rich.console import Console
-
 from recon.files.metrics import Metrics, shown
+from recon.files.occupied import occupied
 from recon.tracking import networks
 from scenes.catalogue import parse_scene
 from sonotwin import demonstration, pipeline
+from sonotwin.console_watch import LineConsole
 from sonotwin.demonstration import Config
 from twin import board_session
 from twin.evaluation import sweep_errors
@@ -35,10 +35,14 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If a setting is wrong, the tracker's networks are missing, a step could not be done, or `out` or `board` holds something
-        else.
+        If a setting is wrong, the tracker's networks are missing, a step could not be done, `out` or `board` holds something
+        else, or another demonstration is at work in `out`.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    with occupied(config.out):
+        _play(config, LineConsole())
+
+
+def _play(config: Config, console: LineConsole) -> None:
     if config.looks_inside or config.film_frames:
         networks.load(kind=config.rig.target.kind)  # before minutes of work
     parse_scene(config.scene)

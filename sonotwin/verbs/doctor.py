@@ -8,11 +8,10 @@ to be tried. Takes some seconds. Exit status 0 if the core can be used, else 2; 
 
 import textwrap
 
-from rich.console import Console
-
 from recon.errors import InputError
 from recon.model.rig import Part
 from sonotwin import installation
+from sonotwin.console_watch import LineConsole
 
 STYLES = {"ok": "green", "absent": "yellow", "unused": "dim", "problem": "bold red"}
 WHAT = 18  # characters of the second column
@@ -33,7 +32,7 @@ def run(config: Config) -> None:
         If the core can't be used.
     """
     findings = installation.examine()
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     for finding in findings:
         console.print(f"{finding.part:8}{finding.what:{WHAT - 1}} ", end="")
         console.print(f"{finding.state:9}", style=STYLES[finding.state], end="")

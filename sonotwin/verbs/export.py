@@ -49,6 +49,7 @@ from recon.probe_calibration import sound_in_water
 from recon.segmentation import mass_files
 from recon.segmentation.scan_masks import mask_of
 from recon.session.skin_step import POINTS
+from sonotwin.console_watch import LineConsole
 
 MEZA = "meza2021"
 
@@ -101,7 +102,7 @@ def run(config: Config) -> None:
     InputError
         If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     given = (config.capture, config.calibration, config.surface, config.probe, config.masses)
     atomic.check_folder(config.out, "export", inputs=[path for path in given if path is not None])
     written = []

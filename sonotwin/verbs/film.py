@@ -18,12 +18,12 @@ from typing import Annotated, Literal
 import numpy as np
 import yaml
 from pydantic import Field
-from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SweepNameOrNone, sweep_part
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
+from sonotwin.console_watch import LineConsole
 from twin.conditions import Conditions, drifted, printed
 from twin.session import Session
 from twin.shooting import FilmQuality
@@ -53,7 +53,7 @@ def run(config: Config) -> None:
     InputError
         If `out` holds anything but what was rendered.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     session = Session(
         config.out, sweep_part(config.name), config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS
     )

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, PlainValidator
-from rich.console import Console
 
 from recon import registry
 from recon.capture.layouts import Known, meza2021
@@ -24,6 +23,7 @@ from recon.capture.writer import new_capture
 from recon.files import atomic
 from recon.model.probe import Speed
 from recon.model.rig import Part, Positive
+from sonotwin.console_watch import LineConsole
 
 LAYOUTS = "recon.capture.layouts"  # a module each
 Pixels = Annotated[int, Field(ge=8, le=20000)]
@@ -57,7 +57,7 @@ def run(config: Config) -> None:
     InputError
         If nothing of the layout is there, a file is damaged, parts don't fit together, or `out` can't be written to.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     atomic.check_folder(config.out, "import", inputs=[config.folder])
     known = Known(config.camera_hz, config.purpose, config.projector_size, config.speed_m_s)
     fill = registry.kind(LAYOUTS, config.layout).read_capture(config.folder, known)

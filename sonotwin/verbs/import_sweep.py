@@ -19,7 +19,6 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from rich.console import Console
 
 from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.writer import new_capture
@@ -32,6 +31,7 @@ from recon.freehand import volume_compounding
 from recon.model import pose_checks, tracks
 from recon.model.rig import Part
 from recon.model.tracks import Track
+from sonotwin.console_watch import LineConsole
 
 Least = Annotated[int, Field(ge=0)]
 Size = Annotated[int, Field(ge=8)]
@@ -69,7 +69,7 @@ def run(config: Config) -> None:
     InputError
         If one is missing or damaged, they have no time in common, or `out` can't be written to.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     atomic.check_folder(config.out, "import-sweep", inputs=[config.clip, config.poses])
     track = None if config.columns.time is None else pose_tables.read(config.poses, config.columns)
     with console.status("reading the clip"):

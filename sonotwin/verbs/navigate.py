@@ -38,8 +38,9 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
-from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.tracking.tracker import Tracker
+from sonotwin.console_watch import LineConsole
 from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
 
 LOOK_S = 0.2  # between two looks whether all goes on
@@ -134,7 +135,7 @@ def run(config: Config) -> int:
     InputError
         If the capture is incomplete or damaged, a calibration or a network is missing, or a port is taken.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     sources = sources_of(config)
     probe = probe_of(config)
     tracker = tracker_of(config, sources.sizes, sources.bits)

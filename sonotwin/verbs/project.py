@@ -54,6 +54,7 @@ from recon.skin_projection import (
 from recon.skin_projection.projector_image import Drawing, Lines, lit_share
 from recon.skin_projection.skin_curve import SkinCurve
 from recon.skin_projection.skin_registration import SkinShift
+from sonotwin.console_watch import LineConsole
 from sonotwin.open_devices import LiveDevices, of_a_laboratory, open_projector
 
 PICTURE, CURVES, STRIPS, SCENE, EXPECTED = "projector.png", "curves.json", "curves.ply", "scene.glb", "expected_cam1.png"
@@ -137,7 +138,7 @@ def run(config: Config) -> None:
     DeviceError
         If the picture is to be shown and the projector's display isn't there, or goes.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     with opened(config) as projector:
         image = draw(config, console)
         if projector is not None:

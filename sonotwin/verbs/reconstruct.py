@@ -35,7 +35,7 @@ class Config(plan.Settings):
 def run(config: Config) -> int:
     """Do all steps that the capture allows, as `recon.session.plan.run`; returns 1 if a part could not be used, or none."""
     code, usual = code_digest("recon", "sonotwin", folder()), choices.read_rig().probe
-    steps = plan.run(config, config.out, code, usual, ConsoleWatch(), command)
+    steps = plan.run(config, config.out, code, usual, command, ConsoleWatch())
     return 1 if steps.failed or not steps.done else 0
 
 

@@ -48,7 +48,8 @@ from recon.model.boards import Board
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
 from recon.registry import Choice
-from recon.session.settings import NetworkFields
+from recon.session.tracker_settings import NetworkFields
+from sonotwin.console_watch import LineConsole
 from sonotwin.open_devices import AnyDevices, Host, LiveDevices, Opened, open_still, open_sweep
 from sonotwin.terminal_operator import TerminalOperator
 from twin.session import CAPTURE, TRUTH
@@ -173,7 +174,7 @@ class Config(NetworkFields):
 
 def run(config: Config) -> None:
     """Record, and say what was kept."""
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     with open_recording(config.out, config.out.resolve().name) as recording:
         check_place(config, recording)
         with shown(config, console) as (say, show):

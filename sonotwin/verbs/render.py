@@ -28,6 +28,7 @@ from recon.model.patterns import Patterns
 from recon.model.rig import Part, Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
+from sonotwin.console_watch import LineConsole
 from twin import board_session
 from twin.conditions import IDEAL, Conditions, check_board, drifted
 from twin.optics import surface_session
@@ -82,7 +83,7 @@ class Config(Part):
 
 def run(config: Config) -> None:
     """Render, and say what was written."""
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     config = in_working_range(config)
     if config.poses is None:
         render_surface(config, part_of(config), console)

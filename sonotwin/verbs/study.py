@@ -16,12 +16,12 @@ from typing import Annotated, Any
 
 import yaml
 from pydantic import Field, ValidationError, ValidationInfo, model_validator
-from rich.console import Console
 
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Rig
 from sonotwin import study_steps
 from sonotwin.config import compose, defaults, folder
+from sonotwin.console_watch import LineConsole
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
 from twin.engine import Engine
 from twin.experiments.experiment_runs import MODULES, Settings
@@ -118,7 +118,7 @@ def run(config: Config) -> int:
     InputError
         If a factor isn't a field of the experiment, a value is nonsense, or `out` holds something else.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     console.print(f"rig         {working_range(config.settings.rig).in_words()}", markup=False)
     if config.search is not None:
         return 0 if study_steps.search(config, config.search, console) else 1

@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SCANNER, sweep_part
+from sonotwin.console_watch import LineConsole
 from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
@@ -52,7 +53,7 @@ def run(config: Config) -> None:
     InputError
         If the scene has no acoustics or not what the path is about, or `out` can't be written to.
     """
-    console = Console(soft_wrap=True, highlight=False)
+    console = LineConsole()
     settings = config.model_dump(mode="json", exclude={"out", "add"})
     devices = (SCANNER, *(CAMERAS if config.filmed else ()))
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None

@@ -31,6 +31,7 @@ from recon.files.metrics import Metrics, shown
 from recon.files.occupied import occupied
 from recon.model import circle_layout
 from recon.model.rig import Target
+from sonotwin.console_watch import LineConsole
 from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.checkpoints import TRAIN
@@ -132,7 +133,7 @@ def run(config: Config) -> None:
     for name in [MARKER, *names_of(config)]:
         atomic.check_listed(config.out, name, TRAIN)
     with occupied(config.out):
-        _train(config, Console(soft_wrap=True, highlight=False))
+        _train(config, LineConsole())
 
 
 def _train(config: Config, console: Console) -> None:

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from recon import compiled
+from recon import compiled, user_cache
 
 KERNEL = """
 from recon.compiled import njit
@@ -231,9 +232,25 @@ def test_a_module_is_parsed_once_for_all_processes(tmp_path, monkeypatch):
     assert [look(one), look(one), look(other), look(other)] == [{("threads", "B")}] * 2 + [{("threads", "C")}] * 2
     assert parsed == [one, other]
     (kept,) = (tmp_path / "cache" / "texts").iterdir()
-    kept.write_bytes(kept.read_bytes()[:40])
-    assert look(other) == {("threads", "C")} and parsed == [one, other, other]
+    whole = kept.read_bytes()
+    for damaged in (whole[:40], whole[:-40], whole[:-40] + bytes(40)):
+        kept.write_bytes(damaged)
+        parsed.clear()
+        assert look(other) == {("threads", "C")} and parsed == [other] and kept.read_bytes() == whole
     kept.unlink()
     kept.parent.rmdir()
     kept.parent.write_text("a file in its place")
-    assert look(other) == {("threads", "C")} and len(parsed) == 4
+    assert look(other) == {("threads", "C")} and len(parsed) == 2
+
+
+def test_what_is_long_unused_is_deleted(tmp_path):
+    """Files and folders; what was used a day ago, and is now, stays for another month."""
+    for name, days in {"new": 0, "used.txt": 29, "unused.txt": 31, "unused/code": 31}.items():
+        place = tmp_path / name
+        place.parent.mkdir(exist_ok=True)
+        place.touch()
+        os.utime(place.parent if "/" in name else place, (time.time() - days * 86400,) * 2)
+    user_cache.note_use(tmp_path / "used.txt")
+    user_cache.remove_unused(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"new", "used.txt"}
+    assert time.time() - (tmp_path / "used.txt").stat().st_mtime < 86400

@@ -10,7 +10,7 @@ import pytest
 
 from recon import user_cache
 from recon.errors import InputError
-from sonotwin import cli, verb_help
+from sonotwin import cli, console_watch, verb_help
 from tests.patience import PATIENCE_S
 
 VERBS = sorted(path.stem.replace("_", "-") for path in Path(cli.__file__).with_name("verbs").glob("[a-z]*.py"))
@@ -76,9 +76,10 @@ def test_help_is_made_anew_after_a_change_and_where_nothing_can_be_kept(no_texts
     assert [verb_help.text("check", "") for _ in range(2)] == ["first", "first"]
     monkeypatch.setattr(verb_help, "_state", lambda: "another")
     assert [verb_help.text("check", "") for _ in range(2)] == ["second", "second"]
-    (no_texts / "check.txt").write_bytes(b"\xff")
-    assert verb_help.text("check", "") == "third" and [file.name for file in no_texts.iterdir()] == ["check.txt"]
-    (no_texts / "check.txt").unlink()
+    (kept,) = no_texts.iterdir()
+    kept.write_bytes(b"\xff")
+    assert verb_help.text("check", "") == "third" and [*no_texts.iterdir()] == [kept]
+    kept.unlink()
     no_texts.rmdir()
     no_texts.write_text("a file in its place")
     assert verb_help.text("check", "") == "fourth"
@@ -97,7 +98,19 @@ def test_the_state_is_that_of_all_sources(tmp_path, monkeypatch):
         states.append(verb_help._state())
     (tmp_path / "recon" / "__pycache__").mkdir()
     (tmp_path / "recon" / "__pycache__" / "a.py").write_text("")
+    (tmp_path / "sonotwin" / "conf" / "rig" / "gone.yaml").symlink_to(tmp_path / "nowhere.yaml")
     assert len(set(states)) == 4 and verb_help._state() == states[-1]
+    monkeypatch.setattr(verb_help, "version", lambda name: "another")
+    assert verb_help._state() not in states
+
+
+def test_two_clones_keep_a_text_each(no_texts, tmp_path, monkeypatch):
+    monkeypatch.setattr(verb_help, "make", lambda verb, module: verb_help.__file__)
+    here, made = verb_help.__file__, []
+    for place in (here, str(tmp_path / "clone" / "sonotwin" / "verb_help.py"), here):
+        monkeypatch.setattr(verb_help, "__file__", place)
+        made.append(verb_help.text("check", ""))
+    assert made[0] == made[2] != made[1] and len(list(no_texts.iterdir())) == 2
 
 
 def test_help_waits_for_no_library():
@@ -208,3 +221,38 @@ sys.exit(cli.main([]))
     said = running.communicate(timeout=PATIENCE_S)[1]
     assert running.returncode == status
     assert len(said.splitlines()) == 1 and list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_that_goes_away_ends_no_step(tmp_path):
+    """As in `sonotwin surface ... | head -1`: the result is written, and the status is that of a broken pipe."""
+    program = """
+import sys
+from pathlib import Path
+from sonotwin import cli
+from sonotwin.console_watch import ConsoleWatch
+
+def work(arguments):
+    for line in ("read", "decode", "wrote"):
+        ConsoleWatch().say(line)
+    Path("result").touch()
+
+cli._run = work
+sys.exit(cli.main([]))
+"""
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    env["PYTHONPATH"] = str(Path(cli.__file__).parents[1])
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=env, stdout=writing, stderr=subprocess.PIPE, check=False
+    )
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + cli.BROKEN_PIPE, b"")
+    assert (tmp_path / "result").exists()
+
+
+def test_lines_are_printed_as_they_are(capsys):
+    """Names of folders that are long, in brackets or between colons, too."""
+    line = f"wrote       {'long/' * 60}[bold]/:x:/12.5"
+    console_watch.ConsoleWatch().say(line)
+    assert capsys.readouterr().out == f"{line}\n"

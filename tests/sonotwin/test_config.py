@@ -239,6 +239,16 @@ def test_fields_of_a_choice_are_those_of_the_one_that_is_chosen(overrides, found
         assert {name: getattr(devices, name) for name in found} == found
 
 
+def test_null_is_accepted_where_it_is_the_usual_choice(tmp_path):
+    """As help shows it; beside another choice of the group it is a contradiction."""
+    (tmp_path / "scan.yaml").write_text("defaults: [{rig: null}, _self_]\nout: x\n")
+    model = create_model("Scan", rig=(Rig | None, None), out=(str, "x"))
+    assert config.load("scan", ["rig=null"], model) == config.load("scan", [], model)
+    assert config.load("scan", ["rig=wide"], model).rig.gamma == 1.0
+    with pytest.raises(InputError, match=r"^scan: rig: expected one of narrow, wide, found null"):
+        config.load("scan", ["rig=wide", "rig=null"], model)
+
+
 def test_a_choice_of_ones_own_is_found_whatever_the_temporary_folders_name(tmp_path_factory, monkeypatch):
     place = tmp_path_factory.mktemp("a, b's [c]")
     (place / "mine.yaml").write_text("gamma: 1.5\n")

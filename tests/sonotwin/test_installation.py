@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import sonotwin
 from sonotwin import cli, installation, namesakes
 from twin import llvm
 
@@ -163,13 +164,25 @@ def test_two_distributions_in_one_folder_are_named(tmp_path, monkeypatch):
 
 @pytest.fixture
 def installed(tmp_path) -> Path:
-    """The packages as a wheel has them, `conf` inside the command's own."""
+    """The packages as a wheel has them, `conf` inside the command's own: all files but those that git ignores."""
     build = tomllib.loads(PYPROJECT.read_text())["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert build.keys() == {"packages", "force-include"}, "what includes or leaves out more isn't copied here"
+    ignored = shutil.ignore_patterns(*(line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines()))
     for package in build["packages"]:
-        shutil.copytree(ROOT / package, tmp_path / "site" / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / package, tmp_path / "site" / package, ignore=ignored)
     for source, target in build["force-include"].items():
         shutil.copytree(ROOT / source, tmp_path / "site" / target)
     return tmp_path / "site"
+
+
+def test_an_installation_has_the_public_names(installed, tmp_path):
+    """They are read from a stub, which is no module; type checkers look for it and for `py.typed`."""
+    program = "import sonotwin; print(sonotwin.__file__, *sonotwin.__all__)"
+    environment = os.environ | {"PYTHONPATH": str(installed)}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(installed / "sonotwin" / "__init__.py"), *sonotwin.__all__]
+    assert (installed / "sonotwin" / "py.typed").is_file()
 
 
 def test_a_users_own_files_are_found_from_anywhere_once_it_is_installed(installed, tmp_path):

@@ -42,6 +42,24 @@ def test_the_stub_and_the_page_have_the_same_names():
     assert set(re.findall(r":: sonotwin\.(\w+)", signatures)) == typed
 
 
+@pytest.mark.parametrize(
+    ("stub", "found"),
+    [
+        ('"""Names."""', "none"),
+        (
+            "from recon.errors import InputError as InputError\nfrom recon.rig import (\n    Rig as Rig,\n)",
+            r"from .* import \(",
+        ),
+        ("from recon.errors import InputError", "from recon.errors import InputError$"),
+    ],
+)
+def test_a_stub_that_was_laid_out_otherwise_loses_no_name(stub, found, tmp_path):
+    """As a formatter may wrap its lines: the import says so, and names the file."""
+    (tmp_path / "names.pyi").write_text(stub)
+    with pytest.raises(ImportError, match=rf"names\.pyi: expected lines such as .*, found {found}"):
+        sonotwin._read_places(tmp_path / "names.pyi")
+
+
 @pytest.mark.parametrize("name", sonotwin.__all__)
 def test_each_name_is_documented(name):
     """It can be imported, has a docstring and stands on the page."""

@@ -138,6 +138,7 @@ def test_a_part_that_can_t_be_used_is_named_and_the_others_are_used(tank, tmp_pa
     (["lag_s=nan"], "reconstruct: lag_s: expected"),
     (["find=cysts"], "reconstruct: find: expected"),
     (["spacing_mm=0"], "reconstruct: spacing_mm: expected"),
+    (["spacing_mm=200"], "reconstruct: spacing_mm: expected"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(tank, tmp_path, capsys, fields, complaint):
     assert main(["reconstruct", f"capture={tank}", f"out={tmp_path / 'out'}", *fields]) == 2

@@ -1,6 +1,7 @@
 """The whole calibration, from sightings to a result that knows how sure it is; and captures that must not be trusted."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -259,6 +260,21 @@ def test_a_scrap_of_a_board_is_left_out_with_the_reason(sizes, good):
         [*good[:4], replace(good[4], pixels={**good[4].pixels, "cam2": scrap}), *good[5:]], BOARD, sizes, QUICK
     )
     assert found.dropped == {"04 cam2": "only 7 of 44 points, 8 are needed"}
+
+
+def test_evidence_of_lens_and_board_is_weighed_by_the_last_offsets(sizes, good, monkeypatch):
+    """Those of circles as the adjusted lenses show them, with which all is adjusted once more; not those from before."""
+    weighed = {}
+
+    def weigh(name, of, adjusted):
+        weighed[name] = adjusted.problem
+        return of(adjusted)
+
+    for name in ("board_information", "lens_information"):
+        monkeypatch.setattr(joint_calibration, name, partial(weigh, name, getattr(joint_calibration, name)))
+    found = joint_calibration.calibrate(good, BOARD, sizes, QUICK)
+    assert all(problem.offsets is found.offsets for problem in weighed.values()) and len(weighed) == 2
+    assert weighed["lens_information"].tolerances == found.tolerances
 
 
 def test_with_few_poses_the_lens_is_not_made_poorer_than_it_is(cameras, sizes):

@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
+from recon.estimation.equations import Step
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Pose
@@ -129,6 +130,21 @@ def test_few_good_frames_are_not_taken_for_outliers_of_each_other(probe, frames,
         adjusted = calibrate(observe(probe, frames[0][some], frames[1][some], rng), SIZE, NOISE, max_sigma_mm=100)
         kept.append((~adjusted.outliers).mean())
     assert np.mean(np.array(kept) > 0.8) >= 0.9
+
+
+def test_a_frame_that_alone_shows_what_others_leave_open_is_no_outlier(probe, frames):
+    """Turns about one axis leave open how far the image stands along it; the one frame of another turn would show that."""
+    turns = np.outer(np.linspace(-35, 35, len(frames[1])), [1, 0, 0])
+    turns[-1] = [0, 25, 10]
+    sightings, planar = Sightings(poses_of(probe, turns, frames[1]), frames[1]), np.arange(len(turns)) < len(turns) - 1
+    true = point_calibration._Estimate(*point_calibration.closed_form(sightings.poses, sightings.pixels))
+    equations, _ = point_calibration._normal_equations(true, sightings.of(planar), NOISE, np.ones(planar.sum()))
+    values, vectors = np.linalg.eigh(equations.shared)
+    assert values[0] < 1e-9 * values[-1]
+    moved = true.moved(Step(20.0 * vectors[:, 0], np.zeros((0, 0))))
+    off = point_calibration._squared(moved, sightings, NOISE)
+    assert off[planar].max() < 1 and off[-1] > 10 * point_calibration.GATE
+    assert point_calibration._squared_as_predicted(moved, sightings, NOISE, planar)[-1] < 1
 
 
 def test_wires_are_found_in_images_by_themselves(probe, frames, rng):

@@ -2,7 +2,6 @@
 
 import json
 import os
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -40,8 +39,7 @@ def done(folder: Path, work, value: str = "1", source: Path | None = None, say=l
     steps = Store(folder, say, code)
     with steps.opened([]):
         made_of = {"files": files_of([source] if source else [])}
-        settings = Settings(value=value)
-        steps.do("part", "a part", "verb", settings, partial(work.run, settings), ("result.txt",), made_of)
+        steps.do("part", "a part", "verb", Settings, {"value": value}, work.run, ("result.txt",), made_of)
     return steps
 
 
@@ -73,6 +71,17 @@ def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, wor
     assert lines[-1] == f"left out    part: capture: expected frames, found none; {tmp_path / 'part'} is of an earlier run"
     done(tmp_path, work, "1")
     assert work.calls == ["1", "2", "1"], "the result of before no longer counts"
+
+
+def test_settings_that_do_not_fit_fail_one_step_in_one_line(tmp_path, work):
+    """What one step refuses of the settings of all is no end of the others."""
+    lines = []
+    steps = Store(tmp_path, lines.append, "a")
+    with steps.opened([]):
+        assert steps.do("part", "a part", "verb", Settings, {"value": 3}, work.run, ("result.txt",), {}) is None
+        assert steps.do("other", "another", "verb", Settings, {"value": "1"}, work.run, ("result.txt",), {}) is not None
+    assert lines[0].startswith("left out    part: verb: value: expected") and "\n" not in lines[0]
+    assert (steps.failed, steps.done, work.calls) == (["part"], ["other"], ["1"])
 
 
 @pytest.mark.parametrize("before", [None, "1"])

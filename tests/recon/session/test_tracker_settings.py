@@ -1,12 +1,15 @@
 """The tracker as the fields of verbs."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from recon.capture import target_files
 from recon.capture.manifest import CAMERAS
 from recon.errors import InputError
-from recon.session.settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 
 
 @pytest.fixture(scope="module")
@@ -37,3 +40,10 @@ def test_the_target_is_the_measured_one_where_there_is_one(rig, tmp_path):
 def test_a_missing_network_is_named(rig, cameras, tmp_path):
     with pytest.raises(InputError, match=str(tmp_path / "detector.onnx")):
         make_tracker(MeasuredTargetFields(rig=rig, networks=tmp_path), rig.target, cameras, None, None)
+
+
+def test_steps_without_a_tracker_wait_for_none():
+    """The runtime of networks takes a tenth of a second to import, and isn't asked for by those who segment or fuse."""
+    program = "import sys, recon.session.masses_step, recon.session.probe_step; print('onnxruntime' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
