@@ -1,5 +1,6 @@
 """Bad inputs of every verb, by a grammar of faults: each must be refused in one line, quickly, with nothing written."""
 
+import contextlib
 import csv
 import random
 import shutil
@@ -65,7 +66,9 @@ class Result:
 
 def cases(place: Path, commands: Sequence[Command] = COMMANDS) -> list[Case]:
     """All cases of the grammar."""
-    return [case for command in commands for case in (*_of_fields(command), *_of_files(command, place))]
+    with contextlib.chdir(place):  # whose files of patterns are read for their fields
+        of_fields = [list(_of_fields(command)) for command in commands]
+    return [case for command, some in zip(commands, of_fields, strict=True) for case in (*some, *_of_files(command, place))]
 
 
 def _of_fields(command: Command) -> Iterator[Case]:
