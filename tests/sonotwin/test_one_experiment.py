@@ -13,8 +13,7 @@ from sonotwin.config import load
 from sonotwin.demonstration import Config
 from sonotwin.verbs import demo, reconstruct
 from sonotwin.verbs.study import of_conf
-from twin.accuracy import surface_accuracy
-from twin.studies import surface_trial
+from twin.experiments import surface_accuracy, surface_trial
 from twin.working_range import working_range
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,8 +3,8 @@
 import pytest
 
 from sonotwin import choices, study_accuracy
+from twin.experiments.drawn_session import ROLL_DEG
 from twin.studies import beside_paper
-from twin.studies.drawn_session import ROLL_DEG
 from twin.ultrasound.probe_path import WirePath
 
 FEW = {"over": {"conditions": ["lifelike"]}, "seeds": 1, "first_seed": 3}
