@@ -13,7 +13,7 @@ from recon.geometry.camera_jacobian import moved
 from recon.model.calibration import Calibration
 from scenes.board_poses import Config as Poses
 from scenes.board_poses import random_poses
-from scenes.kinds import board, plane
+from scenes.kinds import board
 from tests.twin.experiments.asked import missed, rows
 from twin import board_session
 from twin.experiments import calibration_accuracy
@@ -128,9 +128,8 @@ def test_bent_board(rig, rng):
 def test_rendered_calibration(setup, monkeypatch):
     """Ten rendered poses: residuals and parameters within the bars, and planes and sphere measured with them.
 
-    The bars are those of the full rows, though a quarter of the rays leaves more noise; the nearest plane and the farthest.
+    The bars are those of the full rows, though a quarter of the rays leaves more noise.
     """
     monkeypatch.setattr(calibration_accuracy, "TRACING", Tracing(samples=4, room_lux=20))
-    monkeypatch.setattr(plane, "PAPER_POSES", plane.PAPER_POSES[::4])
     for function in (calibration_accuracy.against_truth, calibration_accuracy.surfaces):
         check(function, function(setup, poses=10))
