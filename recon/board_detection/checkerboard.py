@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.board_detection.corners import Corners, refine_corners
-from recon.board_detection.findings import first_faults
+from recon.board_detection.findings import Detection, first_faults, refuse_bad, spread
 
 Array = NDArray[np.float64]
 
@@ -52,6 +52,20 @@ def refine(image: Array, rough: Array, points: Array, window: float, full: float
     step = 1e-3 * np.ptp(points, axis=0).max() * np.eye(3)
     directions = np.stack([moved(homography, points + step[k]) - moved(homography, points) for k in range(2)], axis=1)
     return refine_corners(image, rough, directions, window, full)
+
+
+def detection(image: Array, rough: Array, points: Array, at: NDArray[np.intp], window: float, full: float) -> Detection:
+    """Corners at their best, of a board's points : (n, 3) mm those `at` : (k,), roughly known : (k, 2) px.
+
+    Raises
+    ------
+    BoardNotFound
+        If too few of them are good.
+    """
+    measured = refine(image, rough, points[at], window, full)
+    good = refuse_bad(faults(measured, window, full), len(at), "corners")
+    pixels, covariance = (spread(each[good], at[good], len(points)) for each in (measured.pixels, measured.covariance))
+    return Detection(pixels, covariance, None)
 
 
 def faults(corners: Corners, window: float, full: float) -> list[str | None]:

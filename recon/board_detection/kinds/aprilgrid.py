@@ -16,12 +16,11 @@ from recon.board_detection.checkerboard import (
     WINDOW,
     astray,
     detected,
+    detection,
     eight_bits,
-    faults,
-    refine,
     shortest_side,
 )
-from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection, refuse_bad, spread
+from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection
 from recon.board_detection.reduced_images import LARGE_PX, reduced
 from recon.model.boards import Array, Board, Shapes
 from recon.model.part import Positive
@@ -81,57 +80,50 @@ class AprilGrid(Board):
         return False
 
     def find(self, image: Array, full: float) -> Detection:
-        """Its corners in an image, as of `recon.board_detection.detect.detect`."""
-        return _find(image, self, full)
+        """Find those corners of an AprilGrid that are in view; see `recon.board_detection.detect.detect`.
+
+        OpenCV has each tag turned by half against AprilTag's own drawing and Kalibr's: its first corner is the lower right one.
+        """
+        grey = eight_bits(image, full)
+        tags, numbers = _tags(grey, self.border_cells)
+        if len(numbers) < min(LEAST_MARKERS, self.columns * self.rows):
+            cells = 3 - self.border_cells
+            others = {
+                MIRRORED: (np.ascontiguousarray(grey[:, ::-1]), self.border_cells),
+                f"tags have a border of {cells} cells: give the board border_cells: {cells}": (grey, cells),
+            }
+            for reason, (other, border) in others.items():
+                if len(_tags(other, border)[1]) > 2 * len(numbers):
+                    raise BoardNotFound(reason)
+        if not len(numbers):
+            raise BoardNotFound("found no tags of 36h11")
+        places = self.corners_of_tags()
+        known, several = numbers < len(places), f"{self.columns} x {self.rows}"
+        if known.sum() <= len(known) / 2:
+            raise BoardNotFound(f"tag {numbers[~known][0]} isn't on a grid of {several} tags: wrong board size")
+        at, rough, points = places[numbers[known]].ravel(), tags[known].reshape(-1, 2), self.points()
+        if not astray(points[at], rough, self.tag_mm) < TAGS_ASTRAY:
+            turned = self.columns != self.rows and _fits_exchanged(tags[known], numbers[known], self)
+            cause = "rows and columns exchanged?" if turned else "wrong columns, rows or spacing_ratio?"
+            raise BoardNotFound(f"tags lie otherwise than on a grid of {several} tags: {cause}")
+        cell = self.tag_mm / (6 + 2 * self.border_cells)
+        clear = (
+            MARGIN * min(np.sqrt(2) * self.border_cells * cell, self.rim_mm) / self.tag_mm
+        )  # of a tag, to what isn't the corner's
+        widest = WINDOW[1] * max(1.0, np.sqrt(image.size / LARGE_PX))  # tags were found in a reduced image, as roughly
+        window = min(min(WINDOW[0], clear) * shortest_side(rough, points[at], self.tag_mm), widest)
+        if window < LEAST_WINDOW:
+            raise BoardNotFound(f"too small: {window:.1f} px between a corner and the cells of its tag")
+        found = detection(image, rough, points, at, window, full)
+        good = np.flatnonzero(np.isfinite(found.pixels).all(axis=1))
+        if len(good) < LEAST_CORNERS:
+            raise BoardNotFound(f"found {len(good)} corners, fewer than {LEAST_CORNERS}")
+        _check_gaps(found.pixels[good], good, self)
+        return found
 
     def shapes(self) -> Shapes:
         """What is printed."""
         return Shapes(np.zeros((0, 3)), _black_cells(self))
-
-
-def _find(image: Array, board: AprilGrid, full: float) -> Detection:
-    """Find those corners of an AprilGrid that are in view; see `recon.board_detection.detect.detect`.
-
-    OpenCV has each tag turned by half against AprilTag's own drawing and Kalibr's: its first corner is the lower right one.
-    """
-    grey = eight_bits(image, full)
-    tags, numbers = _tags(grey, board.border_cells)
-    if len(numbers) < min(LEAST_MARKERS, board.columns * board.rows):
-        cells = 3 - board.border_cells
-        others = {
-            MIRRORED: (np.ascontiguousarray(grey[:, ::-1]), board.border_cells),
-            f"tags have a border of {cells} cells: give the board border_cells: {cells}": (grey, cells),
-        }
-        for reason, (other, border) in others.items():
-            if len(_tags(other, border)[1]) > 2 * len(numbers):
-                raise BoardNotFound(reason)
-    if not len(numbers):
-        raise BoardNotFound("found no tags of 36h11")
-    places = board.corners_of_tags()
-    known, several = numbers < len(places), f"{board.columns} x {board.rows}"
-    if known.sum() <= len(known) / 2:
-        raise BoardNotFound(f"tag {numbers[~known][0]} isn't on a grid of {several} tags: wrong board size")
-    at, rough, points = places[numbers[known]].ravel(), tags[known].reshape(-1, 2), board.points()
-    if not astray(points[at], rough, board.tag_mm) < TAGS_ASTRAY:
-        turned = board.columns != board.rows and _fits_exchanged(tags[known], numbers[known], board)
-        cause = "rows and columns exchanged?" if turned else "wrong columns, rows or spacing_ratio?"
-        raise BoardNotFound(f"tags lie otherwise than on a grid of {several} tags: {cause}")
-    cell = board.tag_mm / (6 + 2 * board.border_cells)
-    clear = (
-        MARGIN * min(np.sqrt(2) * board.border_cells * cell, board.rim_mm) / board.tag_mm
-    )  # of a tag, to what isn't the corner's
-    widest = WINDOW[1] * max(1.0, np.sqrt(image.size / LARGE_PX))  # tags were found in a reduced image, as roughly
-    window = min(min(WINDOW[0], clear) * shortest_side(rough, points[at], board.tag_mm), widest)
-    if window < LEAST_WINDOW:
-        raise BoardNotFound(f"too small: {window:.1f} px between a corner and the cells of its tag")
-    measured = refine(image, rough, points[at], window, full)
-    good = refuse_bad(faults(measured, window, full), len(at), "corners")
-    if good.sum() < LEAST_CORNERS:
-        raise BoardNotFound(f"found {good.sum()} corners, fewer than {LEAST_CORNERS}")
-    _check_gaps(measured.pixels[good], at[good], board)
-    return Detection(
-        spread(measured.pixels[good], at[good], len(points)), spread(measured.covariance[good], at[good], len(points)), None
-    )
 
 
 def _check_gaps(pixels: Array, at: NDArray[np.intp], board: AprilGrid) -> None:
@@ -178,7 +170,7 @@ def _black_cells(board: AprilGrid) -> Array:
     points, boxes, side = board.points()[:, :2], [], board.tag_mm / cells
     for number, corners in enumerate(board.corners_of_tags()):
         left, top = points[corners[0]]
-        image = cv2.aruco.generateImageMarker(family, number, cells, borderBits=board.border_cells)[::-1, ::-1]  # see `_find`
+        image = cv2.aruco.generateImageMarker(family, number, cells, borderBits=board.border_cells)[::-1, ::-1]  # as in `find`
         boxes += [[left + x * side, top + y * side, side, side] for y, x in np.argwhere(image == 0)]
     ends = [np.unique(points[:, axis]) for axis in range(2)]
     x, y = ([line[0] - gap, *line[1::2]] for line in ends)  # where gaps begin

@@ -15,12 +15,11 @@ from recon.board_detection.checkerboard import (
     WINDOW,
     astray,
     detected,
+    detection,
     eight_bits,
-    faults,
-    refine,
     shortest_side,
 )
-from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection, refuse_bad, spread
+from recon.board_detection.findings import MIRRORED, BoardNotFound, Detection
 from recon.errors import InputError
 from recon.model.boards import Array, Board, Shapes, grid
 from recon.model.part import Positive
@@ -62,42 +61,33 @@ class Charuco(Board):
         return False
 
     def find(self, image: Array, full: float) -> Detection:
-        """Its corners in an image, as of `recon.board_detection.detect.detect`."""
-        return _find(image, self, full)
+        """Find those inner corners of a ChArUco board that are in view; see `recon.board_detection.detect.detect`."""
+        grey = eight_bits(image, full)
+        design = _design(self)
+        markers, numbers = _markers(grey, design)
+        if len(numbers) < LEAST_MARKERS and len(_markers(np.ascontiguousarray(grey[:, ::-1]), design)[1]) >= LEAST_MARKERS:
+            raise BoardNotFound(MIRRORED)
+        if not len(numbers):
+            raise BoardNotFound(f"found no markers of {self.dictionary}")
+        _check_markers(markers, numbers, design, self)
+        corners, ids = cv2.aruco.CharucoDetector(design).detectBoard(grey)[:2]
+        count = 0 if ids is None else len(ids)
+        if count < LEAST_CORNERS:
+            raise BoardNotFound(f"found {count} corners beside {len(numbers)} markers, fewer than {LEAST_CORNERS}")
+        rough, at = np.asarray(corners, float).reshape(-1, 2), np.asarray(ids).ravel()
+        points = self.points()
+        if _on_one_line(points[at], self.square_mm):
+            raise BoardNotFound("corners all on one line, but for one at most")
+        side = shortest_side(rough, points[at], self.square_mm)
+        clear = MARGIN * (self.square_mm - self.marker_mm) / np.sqrt(2) / self.square_mm  # of a square, to the nearest marker
+        window = min(min(WINDOW[0], clear) * side, WINDOW[1])
+        if window < LEAST_WINDOW:
+            raise BoardNotFound(f"too small: {window:.1f} px between corners and markers")
+        return detection(image, rough, points, at, window, full)
 
     def shapes(self) -> Shapes:
         """What is printed."""
         return Shapes(np.zeros((0, 3)), _black_cells(self))
-
-
-def _find(image: Array, board: Charuco, full: float) -> Detection:
-    """Find those inner corners of a ChArUco board that are in view; see `recon.board_detection.detect.detect`."""
-    grey = eight_bits(image, full)
-    design = _design(board)
-    markers, numbers = _markers(grey, design)
-    if len(numbers) < LEAST_MARKERS and len(_markers(np.ascontiguousarray(grey[:, ::-1]), design)[1]) >= LEAST_MARKERS:
-        raise BoardNotFound(MIRRORED)
-    if not len(numbers):
-        raise BoardNotFound(f"found no markers of {board.dictionary}")
-    _check_markers(markers, numbers, design, board)
-    corners, ids = cv2.aruco.CharucoDetector(design).detectBoard(grey)[:2]
-    count = 0 if ids is None else len(ids)
-    if count < LEAST_CORNERS:
-        raise BoardNotFound(f"found {count} corners beside {len(numbers)} markers, fewer than {LEAST_CORNERS}")
-    rough, at = np.asarray(corners, float).reshape(-1, 2), np.asarray(ids).ravel()
-    points = board.points()
-    if _on_one_line(points[at], board.square_mm):
-        raise BoardNotFound("corners all on one line, but for one at most")
-    side = shortest_side(rough, points[at], board.square_mm)
-    clear = MARGIN * (board.square_mm - board.marker_mm) / np.sqrt(2) / board.square_mm  # of a square, to the nearest marker
-    window = min(min(WINDOW[0], clear) * side, WINDOW[1])
-    if window < LEAST_WINDOW:
-        raise BoardNotFound(f"too small: {window:.1f} px between corners and markers")
-    measured = refine(image, rough, points[at], window, full)
-    good = refuse_bad(faults(measured, window, full), count, "corners")
-    return Detection(
-        spread(measured.pixels[good], at[good], len(points)), spread(measured.covariance[good], at[good], len(points)), None
-    )
 
 
 def _on_one_line(points: Array, square_mm: float) -> bool:

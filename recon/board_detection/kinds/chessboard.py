@@ -6,8 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.board_detection.checkerboard import WINDOW, board_to_image, eight_bits, faults, moved, refine, shortest_side
-from recon.board_detection.findings import BoardNotFound, Detection, refuse_bad, spread
+from recon.board_detection.checkerboard import (
+    WINDOW,
+    board_to_image,
+    detection,
+    eight_bits,
+    moved,
+    shortest_side,
+)
+from recon.board_detection.findings import BoardNotFound, Detection
 from recon.board_detection.reduced_images import reduced
 from recon.model.boards import Array, Board, Few, Shapes, grid
 from recon.model.part import Positive
@@ -41,33 +48,25 @@ class Chessboard(Board):
         return (self.columns + self.rows) % 2 == 0
 
     def find(self, image: Array, full: float) -> Detection:
-        """Its corners in an image, as of `recon.board_detection.detect.detect`."""
-        return _find(image, self, full)
+        """Find all inner corners of a chessboard; see `recon.board_detection.detect.detect`."""
+        grey = eight_bits(image, full)
+        looked = reduced(grey, FEWEST_PX)
+        found, corners = cv2.findChessboardCornersSB(looked.image, (self.columns, self.rows), flags=_CHESSBOARD)
+        if not found and looked.times > 1:
+            closer = reduced(grey)
+            found, corners = cv2.findChessboardCornersSB(closer.image, (self.columns, self.rows), flags=cv2.CALIB_CB_ACCURACY)
+            looked = closer if found else looked
+        if not found:
+            small = f", looked for in {looked.image.shape[1]}x{looked.image.shape[0]} px" if looked.times > 1 else ""
+            raise BoardNotFound(_why_no_chessboard(looked.image, self) + small)
+        grid = _begun_rightly(looked.full(np.asarray(corners, float).reshape(self.rows, self.columns, 2)), grey)
+        rough, points = grid.reshape(-1, 2), self.points()
+        window = min(WINDOW[0] * shortest_side(rough, points, self.square_mm), WINDOW[1])
+        return detection(image, rough, points, np.arange(len(points)), window, full)
 
     def shapes(self) -> Shapes:
         """What is printed."""
         return Shapes(np.zeros((0, 3)), _black_squares(self))
-
-
-def _find(image: Array, board: Chessboard, full: float) -> Detection:
-    """Find all inner corners of a chessboard; see `recon.board_detection.detect.detect`."""
-    grey = eight_bits(image, full)
-    looked = reduced(grey, FEWEST_PX)
-    found, corners = cv2.findChessboardCornersSB(looked.image, (board.columns, board.rows), flags=_CHESSBOARD)
-    if not found and looked.times > 1:
-        closer = reduced(grey)
-        found, corners = cv2.findChessboardCornersSB(closer.image, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
-        looked = closer if found else looked
-    if not found:
-        small = f", looked for in {looked.image.shape[1]}x{looked.image.shape[0]} px" if looked.times > 1 else ""
-        raise BoardNotFound(_why_no_chessboard(looked.image, board) + small)
-    grid = _begun_rightly(looked.full(np.asarray(corners, float).reshape(board.rows, board.columns, 2)), grey)
-    rough, points = grid.reshape(-1, 2), board.points()
-    window = min(WINDOW[0] * shortest_side(rough, points, board.square_mm), WINDOW[1])
-    measured = refine(image, rough, points, window, full)
-    good = refuse_bad(faults(measured, window, full), len(points), "corners")
-    at = np.flatnonzero(good)
-    return Detection(spread(measured.pixels[good], at, len(points)), spread(measured.covariance[good], at, len(points)), None)
 
 
 def _why_no_chessboard(grey: NDArray[np.uint8], board: Chessboard) -> str:
