@@ -11,14 +11,12 @@ The cache is the user's own, `~/.cache/sonotwin/compiled` on Linux; `SONOTWIN_CA
 import ast
 import hashlib
 import logging
-import os
 import pickle
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
 
 import numba
@@ -128,12 +126,7 @@ def _parsed(path: Path, _: int) -> _Text:
             return pickle.loads(content)
     text = _read(source)
     content = pickle.dumps(text)
-    with suppress(OSError):
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        user_cache.remove_unused(kept.parent)
-        temporary = kept.with_name(f".{kept.name}.{os.getpid()}.{token_hex(4)}")  # of one process, on any machine
-        temporary.write_bytes(stamp + hashlib.sha256(content).digest() + content)
-        temporary.replace(kept)
+    user_cache.keep(kept, stamp + hashlib.sha256(content).digest() + content)
     return text
 
 

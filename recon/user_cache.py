@@ -9,6 +9,7 @@ import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+from secrets import token_hex
 
 from platformdirs import user_cache_path
 
@@ -40,6 +41,16 @@ def remove_unused(folder: Path) -> None:
     for old in folder.glob("*"):
         if time.time() - old.stat().st_mtime > UNUSED_DAYS * DAY_S:
             shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)
+
+
+def keep(place: Path, content: bytes) -> None:
+    """Write a file as a whole, and delete what is unused beside it; a cache that can't be written is none."""
+    with suppress(OSError):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        remove_unused(place.parent)
+        temporary = place.with_name(f".{place.name}.{os.getpid()}.{token_hex(4)}")  # of one process, on any machine
+        temporary.write_bytes(content)
+        temporary.replace(place)
 
 
 def _folder() -> Path:

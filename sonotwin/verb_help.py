@@ -12,7 +12,6 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from secrets import token_hex
 
 from recon import user_cache
 from recon.errors import InputError
@@ -39,7 +38,7 @@ def text(verb: str, module: str) -> str:
     except (OSError, ValueError):
         pass  # none yet
     made = make(verb, module)
-    _keep(place, f"{state}\n{made}")
+    user_cache.keep(place, f"{state}\n{made}".encode())
     return made
 
 
@@ -63,16 +62,6 @@ def make(verb: str, module: str) -> str:
     if choices:
         parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))
     return "\n\n".join(parts)
-
-
-def _keep(place: Path, content: str) -> None:
-    """Write a file as a whole; a cache that can't be written is none."""
-    temporary = place.with_name(f".{place.stem}.{os.getpid()}.{token_hex(4)}")
-    with suppress(OSError):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        user_cache.remove_unused(place.parent)
-        temporary.write_text(content, encoding="utf-8")
-        temporary.replace(place)
 
 
 def _state() -> str:
