@@ -285,7 +285,7 @@ def _remove(path: Path) -> None:
             written_files.remove_replaced(entry, path)
 
 
-def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), adds: Addition | None = None) -> None:
+def check_folder(path: Path, by: str, inputs: Iterable[Path | None] = (), adds: Addition | None = None) -> None:
     """Check, before any long work, that a folder can be written at `path`, and that nothing is lost by it.
 
     Parameters
@@ -293,7 +293,7 @@ def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), adds: Additio
     by : str
         Who writes it: a verb, or a function. Only files that it wrote itself may be replaced.
     inputs : iterable of paths
-        Sources of the folder's content.
+        Sources of the folder's content; None for one that isn't given.
     adds : Addition
         The part that is written into a folder which others may have written, too.
 
@@ -307,19 +307,19 @@ def check_folder(path: Path, by: str, inputs: Iterable[Path] = (), adds: Additio
     _check_writable(path, path.parent)
 
 
-def check_filled_folder(path: Path, by: str, inputs: Iterable[Path] = ()) -> None:
+def check_filled_folder(path: Path, by: str, inputs: Iterable[Path | None] = ()) -> None:
     """The same of a folder that is filled where it stands, not replaced: of one that is there the parent needn't be writable."""
     path = _checked(path, by, inputs)
     _check_writable(path, path)
 
 
-def _checked(path: Path, by: str, inputs: Iterable[Path], adds: Addition | None = None) -> Path:
+def _checked(path: Path, by: str, inputs: Iterable[Path | None], adds: Addition | None = None) -> Path:
     """The place itself behind links, where nothing is lost by writing there; InputError otherwise, as of `check_folder`."""
     named, path = path, Path(os.path.realpath(path))
     if path.is_symlink():
         raise InputError(f"{named}: expected a folder or nothing, found a loop of links")
     for source in inputs:
-        if Path(os.path.realpath(source)).is_relative_to(path):
+        if source is not None and Path(os.path.realpath(source)).is_relative_to(path):
             raise InputError(f"{path}: expected a folder apart from what is read, found it to hold {source}")
     _check_no_file(path)
     if path.is_dir():

@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
+from recon.capture import sweep_part
 from recon.capture.images import Size
+from recon.capture.manifest import Purpose
+from recon.capture.sweep_part import SweepCapture
 from recon.errors import Implausible, InputError
 from recon.freehand import sequence_checks, sequences
 from recon.freehand.sequences import MOST_SECONDS, FrameName, FrameNames
@@ -97,6 +100,20 @@ class SequenceSweep:
 
     def pose_covariance(self, lag_s: float = 0.0) -> None:
         """None: no sequence has a covariance."""
+
+
+def read_source(fields: SequenceFields, capture: Path | None, sweep: str, purpose: Purpose) -> SweepCapture | SequenceSweep:
+    """Open the sweep of a capture, by its name or as the only one for a purpose; without a capture, the sequence.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, or the capture has no such sweep.
+    """
+    if capture is not None:
+        return sweep_part.read_sweep(capture, sweep, purpose, fields.implausible)
+    assert fields.sequence is not None
+    return read_sequence_sweep(fields.sequence, fields.frame_names(FrameNames()), fields.tracker, fields.implausible)
 
 
 def read_sequence_sweep(

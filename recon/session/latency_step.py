@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from recon.capture import lag_files, sweep_part, sweep_tables
+from recon.capture import lag_files, sweep_tables
 from recon.capture.lag_files import LagFile
 from recon.capture.sweep_part import SweepCapture
 from recon.clips import fan_region, image_region
@@ -20,7 +20,6 @@ from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import scan_checks, sequence_sweep
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
-from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.fan import Fan, Sector
 from recon.model.rig import Finite, Part
@@ -95,7 +94,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         If the input is incomplete or damaged, the motion doesn't determine the lag, or `out` can't be written to.
     """
     sources = (settings.capture, settings.sequence, settings.tracker)
-    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    atomic.check_folder(out, BY, inputs=sources)
     sweep = read(settings)
     found = measure(sweep, settings, watch)
     watch.say(f"wrote       {out}/{{{','.join(write(out, sweep, found))}}}")
@@ -140,12 +139,8 @@ def measure(sweep: Sweep, settings: Method | None = None, watch: Watch = SILENT)
 
 def read(settings: Settings) -> Sweep:
     """Open the sweep; of a sequence its B-scans with a time stamp."""
-    if settings.capture is not None:
-        return sweep_part.read_sweep(settings.capture, settings.sweep, "latency", settings.implausible)
-    assert settings.sequence is not None
-    return sequence_sweep.read_sequence_sweep(
-        settings.sequence, settings.frame_names(FrameNames()), settings.tracker, settings.implausible
-    ).timed()
+    sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "latency")
+    return sweep.timed() if isinstance(sweep, SequenceSweep) else sweep
 
 
 def bottom_depths(sweep: Sweep, clip: Clip, top_px: int, fan: Fan | None = None) -> Array:

@@ -8,20 +8,19 @@ import cv2
 import trimesh
 from pydantic import Field, model_validator
 
-from recon.capture import probe_files, sweep_part
 from recon.errors import InputError
 from recon.files import atomic, meshes, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import plus_config
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans, ScansFields
-from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import Positive
 from recon.segmentation import containment, segmented_scans
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
+from recon.session import volume_step
 from recon.session.settings import EchoFields
 from recon.session.watch import SILENT, Watch
 
@@ -80,15 +79,13 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         If the input is incomplete or damaged, there is no tube where one is looked for, or `out` can't be written to.
     """
     sources = (settings.capture, settings.probe, settings.sequence, settings.tracker, settings.config, settings.surface)
-    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    atomic.check_folder(out, BY, inputs=sources)
     skin = None if settings.surface is None else containment.read_skin(settings.surface)
     scans = freehand_scans.in_memory(read(settings))  # what follows reads them some times more
     source = str(settings.capture or settings.sequence)
     freehand_scans.check_size(scans, source, None, settings.implausible)
-    watch.say(f"read        {freehand_scans.summary(scans)}")
-    watch.say(f"depth       {freehand_scans.depths(scans)}")
-    for line in settings.assumptions(scans.speed_m_s, scans.poses_exact):
-        watch.say(f"assumed     {line}")
+    for line in volume_step.describe_source(scans, settings):
+        watch.say(line)
     for line in freehand_scans.cautions(scans):
         watch.say(f"warning     {line}")
     start = perf_counter()
@@ -149,29 +146,13 @@ def find(
 
 
 def read(settings: Settings) -> Scans:
-    """The B-scans in the world, or the parts of them within the clip."""
-    if settings.sequence is not None:
-        return read_sequence(settings, settings.sequence)
-    assert settings.capture is not None
-    sweep = sweep_part.read_sweep(settings.capture, settings.sweep, "volume", settings.implausible)
-    probe = freehand_scans.probe_of(sweep, settings.capture, settings.probe)
-    scans = freehand_scans.of_sweep(sweep, probe, settings.lag, settings.tissue_m_s, settings.unsure)
-    return scans if settings.clip is None else freehand_scans.cut(scans, Clip(*settings.clip))
-
-
-def read_sequence(settings: Settings, path: Path) -> Scans:
-    """The B-scans of a sequence in its reference frame, or the parts of them within the clip."""
+    """The B-scans in the world, or in a sequence's reference frame; the parts of them within the clip."""
     plus = None if settings.config is None else plus_config.read_config(settings.config)
-    if plus is not None and plus.volume is not None and plus.volume.fan is not None and settings.clip is None:
+    by_plus = None if plus is None else plus.volume
+    if by_plus is not None and by_plus.fan is not None and settings.clip is None:
         expected = "none, as masses are sought in rectangles; give clip=[u,v,width,height] within it"
         raise InputError(f"{settings.config}: FanAnglesDeg: expected {expected}, found a fan")
-    names = settings.frame_names(FrameNames() if plus is None else plus.names)
-    probe = None if settings.probe is None else probe_files.read(settings.probe)
-    fixed = {} if plus is None else plus.transforms
-    scans = freehand_scans.of_sequence(
-        path, names, probe, fixed, settings.lag, settings.tissue_m_s, settings.tracker, settings.implausible
-    )
-    clip = (
-        Clip(*settings.clip) if settings.clip is not None else None if plus is None or plus.volume is None else plus.volume.clip
-    )
+    _, scans = volume_step.read(settings, plus)
+    given = None if settings.clip is None else Clip(*settings.clip)
+    clip = by_plus.clip if given is None and by_plus is not None else given
     return scans if clip is None else freehand_scans.cut(scans, clip)

@@ -72,7 +72,7 @@ def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> N
     InputError
         If the capture is incomplete or damaged, doesn't determine the devices, or `out` can't be written to.
     """
-    atomic.check_folder(out, BY, inputs=[path for path in (settings.capture, settings.truth) if path is not None])
+    atomic.check_folder(out, BY, inputs=(settings.capture, settings.truth))
     captured = board_part.read_board(settings.capture)
     sizes = board_frames.sizes_of(captured, settings.devices)
     truth = None if settings.truth is None else calibration_files.read_for(settings.truth / manifest.OPTICS, sizes)

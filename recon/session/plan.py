@@ -124,7 +124,7 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
     """
     sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command)
     steps = Store(out, watch.announce, code)
-    given = [path for path in (settings.calibration, settings.target, settings.probe, settings.networks) if path is not None]
+    given = (settings.calibration, settings.target, settings.probe, settings.networks)
     check(sources)
     with steps.opened([settings.capture, *given]):
         optics = calibrate_optics(steps, sources)

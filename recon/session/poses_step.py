@@ -39,7 +39,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> list[Step]:
         If the capture is incomplete or damaged, a network is missing, or `out` can't be written to.
     """
     sources = (settings.capture, settings.calibration, settings.target, settings.networks)
-    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    atomic.check_folder(out, BY, inputs=sources)
     film = stereo_frames.read_film(settings.capture, settings.calibration, settings.sweep)
     target = target_of(settings)
     tracker = make_tracker(settings, target, film.cameras, film.optics, film.bits)

@@ -8,13 +8,12 @@ from typing import Annotated
 
 from pydantic import model_validator
 
-from recon.capture import probe_files, sweep_part, sweep_tables
+from recon.capture import probe_files, sweep_tables
 from recon.capture.sweep_part import SweepCapture
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import sequence_sweep
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
-from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.rig import Probe, Rig
 from recon.model.tracks import LagSeconds
@@ -83,7 +82,7 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
     """
     sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker)
-    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    atomic.check_folder(out, BY, inputs=sources)
     earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
     if settings.temperature_c is not None:
         sound_in_water.speed_of_sound(settings.temperature_c)  # a mistake shows before the work
@@ -91,7 +90,8 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     if settings.pairs is not None:
         frames = crossing_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
-        frames = look(read(settings), settings, settings.lag_s, settings.clip, watch)
+        sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "probe")
+        frames = look(sweep, settings, settings.lag_s, settings.clip, watch)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
     for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
         watch.say(line)
@@ -159,16 +159,6 @@ def calibrate(
     for line in probe_figures.describe(frames, result, figures, design, settings):
         watch.say(line)
     return CalibratedProbe(frames, result, figures | seconds)
-
-
-def read(settings: Settings) -> SweepCapture | SequenceSweep:
-    """Open the sweep over the wires."""
-    if settings.capture is not None:
-        return sweep_part.read_sweep(settings.capture, settings.sweep, "probe", settings.implausible)
-    assert settings.sequence is not None
-    return sequence_sweep.read_sequence_sweep(
-        settings.sequence, settings.frame_names(FrameNames()), settings.tracker, settings.implausible
-    )
 
 
 def write(out: Path, found: CalibratedProbe, figures: Metrics) -> list[str]:

@@ -78,7 +78,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         If the capture is incomplete or damaged, a given file is missing, or `out` can't be written to.
     """
     given = (settings.probe, settings.surface, settings.masses, settings.calibration, settings.volume, settings.mask)
-    atomic.check_folder(out, BY, inputs=[settings.capture, *(path for path in given if path is not None)])
+    atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     voxels = volumes(settings)
     with watch.busy("putting it together"):
         scene = read(settings)

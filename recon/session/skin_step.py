@@ -83,7 +83,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         If the input is incomplete or damaged, `out` can't be written to, or the devices have no view in common.
     """
     sources = (settings.capture, settings.images, settings.calibration)
-    atomic.check_folder(out, BY, inputs=[path for path in sources if path is not None])
+    atomic.check_folder(out, BY, inputs=sources)
     clock = Stopwatch()
     with clock.stage("read"):
         shots = read(settings)

@@ -35,7 +35,7 @@ class Store:
     failed: list[str] = field(default_factory=list)  # steps that could not be done
 
     @contextmanager
-    def opened(self, inputs: Iterable[Path]) -> Iterator[None]:
+    def opened(self, inputs: Iterable[Path | None]) -> Iterator[None]:
         """Take up the record of an earlier run, or begin one; another run on the same folder waits until this one has ended.
 
         In the end, results of earlier runs that are no part of this one leave the record, and are named.

@@ -42,8 +42,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     InputError
         If the capture is incomplete or damaged, doesn't show the target from enough sides, or `out` can't be written to.
     """
-    inputs = [path for path in (settings.capture, settings.calibration, settings.networks) if path is not None]
-    atomic.check_folder(out, BY, inputs=inputs)
+    atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.networks))
     film = stereo_frames.read_film(settings.capture, settings.calibration, settings.sweep)
     adjusted = calibrate(film, settings, watch)
     figures = target_figures.measure(adjusted, settings.rig.target)

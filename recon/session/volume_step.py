@@ -93,12 +93,10 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     plus = None if settings.config is None else plus_config.read_config(settings.config)
     chosen = volume_settings(settings, plus)
     given = (settings.capture, settings.probe, settings.sequence, settings.tracker, settings.config, chosen.weights)
-    atomic.check_folder(out, BY, inputs=[path for path in given if path is not None])
+    atomic.check_folder(out, BY, inputs=given)
     sweep, scans = read(settings, plus)
-    watch.say(f"read        {freehand_scans.summary(scans)}")
-    watch.say(f"depth       {freehand_scans.depths(scans)}")
-    for line in settings.assumptions(scans.speed_m_s, scans.poses_exact):
-        watch.say(f"assumed     {line}")
+    for line in describe_source(scans, settings):
+        watch.say(line)
     clip = chosen.box(scans.shape)
     for line in freehand_scans.cautions(scans if clip is None else freehand_scans.cut(scans, clip)):
         watch.say(f"warning     {line}")
@@ -164,7 +162,7 @@ def volume_settings(settings: Settings, plus: PlusConfig | None) -> VolumeSettin
     return replace(chosen, fan=None) if settings.fan == "none" else chosen
 
 
-def read(settings: Settings, plus: PlusConfig | None) -> tuple[SweepCapture | None, Scans]:
+def read(settings: ScansFields, plus: PlusConfig | None) -> tuple[SweepCapture | None, Scans]:
     """Read the sweep, if it is a capture's, and its B-scans in the world."""
     if settings.capture is None:
         assert settings.sequence is not None
@@ -177,6 +175,14 @@ def read(settings: Settings, plus: PlusConfig | None) -> tuple[SweepCapture | No
     sweep = sweep_part.read_sweep(settings.capture, settings.sweep, "volume", settings.implausible)
     probe = freehand_scans.probe_of(sweep, settings.capture, settings.probe)
     return sweep, freehand_scans.of_sweep(sweep, probe, settings.lag, settings.tissue_m_s, settings.unsure)
+
+
+def describe_source(scans: Scans, settings: ScansFields) -> Iterator[str]:
+    """Lines: what was read, and what is assumed of it."""
+    yield f"read        {freehand_scans.summary(scans)}"
+    yield f"depth       {freehand_scans.depths(scans)}"
+    for line in settings.assumptions(scans.speed_m_s, scans.poses_exact):
+        yield f"assumed     {line}"
 
 
 def advice(scans: Scans, chosen: VolumeSettings) -> Iterator[str]:

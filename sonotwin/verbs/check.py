@@ -98,8 +98,7 @@ def run(config: Config) -> int:
     """
     watch = ConsoleWatch()
     given = (config.capture, config.tracked, config.calibration, config.probe, config.lag, config.target, config.log)
-    inputs = [path for path in given if path is not None]  # the log, too: a folder that is replaced would take it along
-    atomic.check_folder(config.out, "check", inputs=inputs)
+    atomic.check_folder(config.out, "check", inputs=given)  # the log, too: a folder that is replaced would take it along
     earlier = check_log.read(config.log) if config.log is not None and config.log.exists() else []
     listed = manifest.read_manifest(config.capture)
     held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))

@@ -104,7 +104,7 @@ def run(config: Config) -> None:
     """
     console = LineConsole()
     given = (config.capture, config.calibration, config.surface, config.probe, config.masses)
-    atomic.check_folder(config.out, "export", inputs=[path for path in given if path is not None])
+    atomic.check_folder(config.out, "export", inputs=given)
     written = []
     if config.layout != MEZA:
         export_cameras(config, console)

@@ -149,7 +149,7 @@ def run(config: Config) -> None:
 def draw(config: Config, console: Console) -> NDArray[np.uint8]:
     """Read what is given, draw, and write; returns the picture : (h, w)."""
     given = (config.skin, config.calibration, config.masses, config.cut, config.earlier_skin, config.capture, config.probe)
-    atomic.check_folder(config.out, "project", inputs=[path for path in given if path is not None])
+    atomic.check_folder(config.out, "project", inputs=given)
     if config.masses is None and config.cut is None and config.capture is None:
         raise InputError("project: expected masses, a cut or a capture to draw, found none of them")
     cameras = calibration_files.read(config.calibration).cameras
