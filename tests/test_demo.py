@@ -1,19 +1,24 @@
 """The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
 
+import contextlib
 import html
+import io
 import json
 import os
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from recon.capture import manifest
+from recon.capture import manifest, probe_files
 from recon.errors import InputError
 from recon.files import atomic
 from recon.files.occupied import occupied
+from recon.files.written_files import LIST
+from recon.probe_calibration.repeatability import five_points
 from recon.tracking import networks
 from sonotwin import demonstration, pipeline, rendered_session
 from sonotwin.cli import main
@@ -22,6 +27,7 @@ from sonotwin.demonstration import Config
 from sonotwin.pipeline import Step
 from sonotwin.verbs import evaluate, film, reconstruct, render, sweep, track
 from sonotwin.verbs.demo import followed, looked_inside
+from twin.evaluation import session_errors, sweep_errors, track_errors
 
 SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "rig.cam1.optics.size=[640,512]",
@@ -92,11 +98,21 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
         assert parts[name].ultrasound.image_size == (161, 272)
 
 
+@pytest.fixture(scope="module")
+def demonstrated(tmp_path_factory) -> tuple[Config, list[str]]:
+    """The demonstration without errors of the laboratory: its settings, and the lines that it printed."""
+    folder = tmp_path_factory.mktemp("demonstrated")
+    fields = ["conditions=ideal", f"out={folder / 'demo'}", f"board={folder / 'board'}"]
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        assert main(["demo", *fields]) == 0
+    return load("demo", fields, Config), printed.getvalue().splitlines()
+
+
 @pytest.mark.slow
-def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
+def test_the_demonstration_is_as_good_as_the_noise_allows(demonstrated):
     """Outside, inside, and the report of both."""
-    out = tmp_path / "demo"
-    assert main(["demo", "conditions=ideal", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
+    out, printed = demonstrated[0].out, demonstrated[1]
     assert not [name for name in (*MADE, *MADE_INSIDE) if not (out / name).is_file()]
     metrics = figures(out)
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
@@ -117,11 +133,53 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
     assert metrics["tumour0_dice"] > 0.85
     assert all(f"seconds_{name}" in metrics for name in ("render", "board", "wires", "bottom", "scan", "reconstruct", "evaluate"))
     said = ["measured", "accuracy", "calibrated", "probe", "lag", "tumours", "tracked", "coverage", "look"]
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[-9:]] == said
+    assert [line.split()[0] for line in printed[-9:]] == said
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))
     assert "From board to tumour" in report and 'data-slide="scene"' in report
     assert "sonotwin reconstruct" in report and "tumours, found" in report
     assert (out / "report.html").stat().st_size < 12e6
+    errors = session_errors.measure(out / "result", out / "capture", out / "truth")
+    for name in ("wires", "bottom"):
+        assert errors[f"{name}_track_visible_found"] == errors[f"{name}_track_visible"] > 0
+        assert errors[f"{name}_track_false"] == 0 and errors[f"{name}_track_shift_median_mm"] < 0.1
+    truth = sweep_errors.read_truth(out / "truth", "scan")
+    probe = probe_files.read(out / "result" / "probe" / "probe.yaml")
+    off, sigma = sweep_errors.probe_errors(probe, truth, five_points(truth.transducer.image_size))
+    assert off.max() < 0.6 and (off < 4 * sigma).all()
+
+
+@pytest.mark.slow
+def test_lost_steps_come_back_to_the_same_bytes_without_the_truth(demonstrated, capsys):
+    """With those that build on them, but for the seconds in metrics.json and its digest in the list. No other is done again."""
+    config, _ = demonstrated
+    result = config.out / "result"
+
+    def contents() -> dict[str, bytes]:
+        files = (path for path in sorted(result.rglob("*")) if path.is_file() and path.name not in ("metrics.json", LIST))
+        return {str(path.relative_to(result)): path.read_bytes() for path in files}
+
+    before = contents()
+    for name in ("surface", "poses/wires", "latency"):
+        shutil.rmtree(result / name)
+    (config.out / "truth").rename(config.out.parent / "truth")
+    try:
+        assert reconstruct.run(config.reconstruction) == 0
+    finally:
+        (config.out.parent / "truth").rename(config.out / "truth")
+    said = capsys.readouterr().out
+    assert all(f"kept        {name}" in said for name in ("optics", "poses/scan", "poses/bottom"))
+    assert contents() == before
+
+
+@pytest.mark.slow
+def test_the_truth_of_the_frames_is_the_paths(demonstrated):
+    """The board moves over an exposure as fast as from frame to frame, and is seen whole in most of them."""
+    config, _ = demonstrated
+    with np.load(config.out / "truth" / "sweep" / "scan" / "film.npz") as film:
+        places, speed = film["world_from_target"][:, :3, 3], film["shift_mm"] / 0.01
+    between = (places[2:] - places[:-2]) * config.clocks.camera_hz / 2
+    assert np.median(np.linalg.norm(speed[1:-1] - between, axis=1)) < 0.1 * np.median(np.linalg.norm(between, axis=1))
+    assert track_errors.visible_whole(track_errors.read_truth(config.out / "truth", "scan")).mean() > 0.9
 
 
 def silent(_):
