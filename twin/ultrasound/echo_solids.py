@@ -1,7 +1,8 @@
 """The scene as echoes see it: solids by their signed distance on a grid, wires by their ends.
 
 A distance is negative inside. Solids may lie within one another: where several hold a point, the last one counts, and the
-smaller come later. A plane's distance is linear, and so exact on a grid of two points; a cylinder's is sampled from its formula.
+smaller come later; so of a border that two share. A box along the axes is known by its bounds; other distances are sampled on a
+grid, so that between its points a plane's is exact, a curved face's off by its sag, and an edge rounded within a cell.
 """
 
 from collections.abc import Callable
@@ -12,20 +13,20 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label, sum_labels
+from scipy.ndimage import map_coordinates
 
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.geometry.primitives import Cylinder
-from recon.geometry.surface_tree import surface_tree
 from scenes.acoustics import BACKSCATTER, Tissue, faster, surroundings, tissue_of
 from scenes.scene_types import Scene, Thing
 from twin import conditions
 from twin.conditions import Sound
+from twin.ultrasound.mesh_distance import Grid, signed_distances
 
 Array = NDArray[np.float64]
 
-MARGIN_MM = 3.0  # of the grids, around the solid
+MARGIN_MM = 3.0  # of the grids, around the solid, and most of a mesh's distance
 
 FIRST, NX, NY, NZ = range(4)  # columns of `Solids.grid`
 X0, Y0, Z0, PER_X, PER_Y, PER_Z = range(6)  # columns of `Solids.frame`
@@ -35,8 +36,8 @@ class Solids(NamedTuple):
     """Signed distances of the n solids on their grids, for compiled code; a row a solid."""
 
     distance: NDArray[np.float32]  # (m,) mm, of all grids, one after the other
-    grid: NDArray[np.int64]  # (n, 4) place of the first value in `distance`, and points along x, y, z
-    frame: Array  # (n, 6) first point, mm in the world, and points a mm
+    grid: NDArray[np.int64]  # (n, 4) place of the first value in `distance`, and points along x, y, z: none of a box
+    frame: Array  # (n, 6) first point, mm in the world, and points a mm; of a box its middle, and half its sides, mm
 
 
 class Tissues(NamedTuple):
@@ -54,10 +55,23 @@ class Solid:
 
     name: str
     tissue: Tissue
-    distance: NDArray[np.float32]  # (nx, ny, nz) mm, negative inside
+    distance: NDArray[np.float32]  # (nx, ny, nz) mm, negative inside; none of a box, which its mesh's bounds tell
     origin: Array  # (3,) mm in the world, of the first grid point
     spacing: Array  # (3,) mm
     mesh: trimesh.Trimesh  # for exact sections
+
+    @property
+    def is_box(self) -> bool:
+        """Whether it is a box along the axes, without a grid."""
+        return not self.distance.size
+
+    def distances(self, points: Array) -> Array:
+        """Signed distances : (n,) mm of points : (n, 3) in the world; 1e3 outside the grid."""
+        if self.is_box:
+            beyond = np.abs(points - self.mesh.bounds.mean(axis=0)) - self.mesh.extents / 2
+            return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+        places = ((points - self.origin) / self.spacing).T
+        return map_coordinates(self.distance, places, order=1, mode="constant", cval=1e3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +106,12 @@ class Body:
         sizes = [solid.distance.size for solid in self.solids]
         starts = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
         grid = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]
-        frame = [(*solid.origin, *(1 / solid.spacing)) for solid in self.solids]
+        frame = [
+            (*solid.mesh.bounds.mean(axis=0), *(solid.mesh.extents / 2))
+            if solid.is_box
+            else (*solid.origin, *(1 / solid.spacing))
+            for solid in self.solids
+        ]
         flat = np.concatenate([solid.distance.ravel() for solid in self.solids]) if sizes else np.zeros(0, np.float32)
         return Solids(flat, np.array(grid, np.int64).reshape(-1, 4), np.array(frame, float).reshape(-1, 6))
 
@@ -117,7 +136,7 @@ def body(scene: Scene) -> Body:
     Raises
     ------
     InputError
-        If a thing's tissue is unknown.
+        If a thing's tissue is unknown, its mesh is open, or its grid too large.
     """
     shapes = {shape.name: shape for shape in scene.shapes if isinstance(shape, Cylinder)}
     solids, wires = [], []
@@ -144,49 +163,43 @@ def at_speeds(body: Body, errors: Sound, *key: int) -> Body:
 
 
 def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
-    """A thing by its signed distance: exact for boxes along the axes, spheres and cylinders, sampled from the mesh otherwise."""
-    bounds = thing.mesh.bounds
+    """A thing by its signed distance: of a box along the axes, a sphere or a cylinder by its formula, else of the mesh."""
+    spacing_mm = 0.5 if thing.mesh.extents.max() <= 60.0 else 1.0  # of the grids of small and of large solids
     sag_mm = 0.001  # by which a rod's wall lies within the true one: of a chord between the points of its grid
+    steps = np.full(3, spacing_mm)
     if shape is not None:
         along = (thing.mesh.vertices - shape.point) @ shape.axis
-        across = min(_spacing(thing), float(np.sqrt(8 * shape.radius * sag_mm)))
-        steps = np.where(np.abs(shape.axis) > 1 - 1e-9, _spacing(thing), across)  # along the axis the wall is straight
-        return _sample(thing, tissue, lambda points: _in_rod(points, shape, along.min(), along.max()), steps)
-    if thing.primitive is not None:
-        return _sample(thing, tissue, thing.primitive.distance, np.full(3, _spacing(thing)))
-    if np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
-        distance, steps = _box(bounds)
-        return Solid(thing.name, tissue, distance, bounds[0] - MARGIN_MM, steps, thing.mesh)
-    step = _spacing(thing)
-    points, low = _grid(thing, np.full(3, step))
-    return Solid(thing.name, tissue, _from_mesh(thing.mesh, points, step), low, np.full(3, step), thing.mesh)
+        across = min(spacing_mm, float(np.sqrt(8 * shape.radius * sag_mm)))
+        steps = np.where(np.abs(shape.axis) > 1 - 1e-9, spacing_mm, across)  # along the axis the wall is straight
+        grid = _grid(thing, steps)
+        distance = _sampled(grid, lambda points: _in_rod(points, shape, along.min(), along.max()))
+    elif thing.primitive is not None:
+        grid = _grid(thing, steps)
+        distance = _sampled(grid, thing.primitive.distance)
+    elif not thing.mesh.is_watertight:
+        raise InputError(f"scene: {thing.name}: expected a closed mesh, found open edges; merge its vertices, or fill its holes")
+    elif np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
+        return Solid(thing.name, tissue, np.zeros((0, 0, 0), np.float32), thing.mesh.bounds[0], steps, thing.mesh)
+    else:
+        grid = _grid(thing, steps)
+        distance = signed_distances(np.asarray(thing.mesh.triangles, float), grid, MARGIN_MM)
+    return Solid(thing.name, tissue, distance, grid.first, steps, thing.mesh)
 
 
-def _spacing(thing: Thing) -> float:
-    large_mm = 60.0  # greatest extent of a small one
-    spacing_mm = (0.5, 1.0)  # of the grids, of small and of large solids
-    return spacing_mm[int(thing.mesh.extents.max() > large_mm)]
-
-
-def _grid(thing: Thing, steps: Array) -> tuple[Array, Array]:
-    """Points : (nx, ny, nz, 3) around a thing, and the first of them."""
+def _grid(thing: Thing, steps: Array) -> Grid:
+    """Points around a thing."""
     low, high = thing.mesh.bounds[0] - MARGIN_MM, thing.mesh.bounds[1] + MARGIN_MM
-    counts = np.ceil((high - low) / steps).astype(int) + 1
-    _check_count(thing.name, counts)
-    axes = [low[k] + steps[k] * np.arange(counts[k]) for k in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), low
-
-
-def _check_count(name: str, counts: Array) -> None:
-    most_points = 3e8  # of a grid
+    counts, most_points = np.ceil((high - low) / steps).astype(int) + 1, 3e8
     if (points := np.prod(counts.astype(float))) > most_points:
-        raise InputError(f"scene: {name}: expected a thing whose grid has up to {most_points:g} points, found {points:.2g}")
+        raise InputError(f"scene: {thing.name}: expected a thing whose grid has up to {most_points:g} points, found {points:.2g}")
+    return Grid(low, steps, counts)
 
 
-def _sample(thing: Thing, tissue: Tissue, distance: Callable[[Array], Array], steps: Array) -> Solid:
-    points, low = _grid(thing, steps)
-    values = np.stack([distance(sheet.reshape(-1, 3)).reshape(sheet.shape[:-1]) for sheet in points])
-    return Solid(thing.name, tissue, values.astype(np.float32), low, steps, thing.mesh)
+def _sampled(grid: Grid, distance: Callable[[Array], Array]) -> NDArray[np.float32]:
+    """A formula's distances at a grid's points, plane by plane."""
+    x, y, z = (grid.first[k] + grid.steps[k] * np.arange(grid.counts[k]) for k in range(3))
+    sheets = (np.stack(np.meshgrid(each, y, z, indexing="ij"), axis=-1).reshape(-1, 3) for each in x)
+    return np.stack([distance(sheet).reshape(len(y), len(z)) for sheet in sheets]).astype(np.float32)
 
 
 def _in_rod(points: Array, rod: Cylinder, first: float, last: float) -> Array:
@@ -194,39 +207,6 @@ def _in_rod(points: Array, rod: Cylinder, first: float, last: float) -> Array:
     along = offset @ rod.axis
     radial = np.linalg.norm(offset - np.outer(along, rod.axis), axis=1) - rod.radius
     return np.maximum(radial, np.maximum(first - along, along - last))
-
-
-def _box(bounds: Array) -> tuple[NDArray[np.float32], Array]:
-    """Distance on few points: between them it is linear, as far as it matters near a face."""
-    low, high = bounds[0] - MARGIN_MM, bounds[1] + MARGIN_MM
-    counts = np.maximum(np.ceil((high - low) / 5.0).astype(int), 4) + 1
-    steps = (high - low) / (counts - 1)
-    axes = [low[k] + steps[k] * np.arange(counts[k]) for k in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    outside = np.maximum(bounds[0] - points, points - bounds[1])
-    return outside.max(axis=-1).astype(np.float32), steps
-
-
-def _from_mesh(mesh: trimesh.Trimesh, points: Array, step: float) -> NDArray[np.float32]:
-    """Distance along the normal of the nearest vertex, within a band: second order in the facet's size, where vertices are dense.
-
-    Farther away each connected region takes the side of most of its neighbours in the band. The mesh's box bounds it as well,
-    for a flat base may have no vertices of its own.
-    """
-    flat = points.reshape(-1, 3)
-    band_mm = 3.0  # from a mesh, beyond which only the sign of its distance counts
-    far, nearest = surface_tree(mesh.vertices).query(flat, distance_upper_bound=band_mm)
-    near = np.isfinite(far)
-    value = np.full(len(flat), band_mm)
-    value[near] = ((flat[near] - mesh.vertices[nearest[near]]) * mesh.vertex_normals[nearest[near]]).sum(axis=1)
-    value, near = value.reshape(points.shape[:-1]), near.reshape(points.shape[:-1])
-    beyond = np.maximum(mesh.bounds[0] - points, points - mesh.bounds[1]).max(axis=-1)
-    source = distance_transform_edt(~near, sampling=step, return_distances=False, return_indices=True)
-    votes = np.sign(value[tuple(source)])
-    regions, count = label(~near & (beyond < 0))
-    side = np.sign(sum_labels(votes, regions, np.arange(count + 1)))
-    value = np.where(near, value, np.where(regions > 0, band_mm * side[regions], beyond))
-    return np.maximum(value, beyond).astype(np.float32)
 
 
 @njit(inline="always")
@@ -237,8 +217,10 @@ def between(low, high, share):
 
 @njit(inline="always")
 def distance_at(solids, solid, x, y, z):
-    """Signed distance of one solid at a point of the world, trilinear; 1e3 outside its grid."""
+    """Signed distance of one solid at a point of the world: of a box exact, else trilinear, and 1e3 outside its grid."""
     grid, frame = solids.grid, solids.frame
+    if grid[solid, NX] == 0:
+        return _box_distance(frame, solid, x, y, z)
     gx = (x - frame[solid, X0]) * frame[solid, PER_X]
     gy = (y - frame[solid, Y0]) * frame[solid, PER_Y]
     gz = (z - frame[solid, Z0]) * frame[solid, PER_Z]
@@ -256,9 +238,19 @@ def distance_at(solids, solid, x, y, z):
 
 
 @njit(inline="always")
+def _box_distance(frame, solid, x, y, z):
+    """Signed distance of a box along the axes."""
+    a = abs(x - frame[solid, X0]) - frame[solid, PER_X]
+    b = abs(y - frame[solid, Y0]) - frame[solid, PER_Y]
+    c = abs(z - frame[solid, Z0]) - frame[solid, PER_Z]
+    d, e, f = max(a, 0.0), max(b, 0.0), max(c, 0.0)
+    return np.sqrt(d * d + e * e + f * f) + min(max(a, b, c), 0.0)
+
+
+@njit(inline="always")
 def label_at(solids, x, y, z):
     """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
     for k in range(len(solids.grid) - 1, -1, -1):
-        if distance_at(solids, k, x, y, z) < 0:
+        if distance_at(solids, k, x, y, z) <= 0:
             return k + 1
     return 0

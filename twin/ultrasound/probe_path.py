@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import gaussian_filter1d, map_coordinates
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
@@ -220,8 +220,7 @@ def top(solid: Solid, places: Array) -> Array:
     search_mm = 0.1  # steps in which the surface is looked for
     depths = np.arange(low - 1, high, search_mm)
     points = np.concatenate([np.repeat(places, len(depths), axis=0), np.tile(depths, len(places))[:, None]], axis=1)
-    grid = ((points - solid.origin) / solid.spacing).T
-    distance = map_coordinates(solid.distance, grid, order=1, mode="constant", cval=1e3).reshape(len(places), -1)
+    distance = solid.distances(points).reshape(len(places), -1)
     first = (distance < 0).argmax(axis=1)
     rows = np.arange(len(places))
     before, after = distance[rows, np.maximum(first - 1, 0)], distance[rows, first]

@@ -239,7 +239,7 @@ def _tissue(distances):
     """Label at the place that distances were measured last."""
     label = 0
     for solid in range(distances.shape[1]):
-        if distances[AFTER, solid] < 0:
+        if distances[AFTER, solid] <= 0:
             label = solid + 1
     return label
 

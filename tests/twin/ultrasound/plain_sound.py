@@ -24,14 +24,18 @@ def distances(body: Body, points: np.ndarray) -> np.ndarray:
 
 
 def distance(one: Solid, points: np.ndarray) -> np.ndarray:
-    """Signed distances : (n,) of points : (n, 3) to a solid; 1e3 outside its grid."""
+    """Signed distances : (n,) of points : (n, 3) to a solid; 1e3 outside its grid, which a box doesn't need."""
+    if one.is_box:
+        low, high = one.mesh.bounds
+        inside = np.minimum(points - low, high - points).min(axis=1)
+        return np.where(inside < 0, np.linalg.norm(points - np.clip(points, low, high), axis=1), -inside)
     return map_coordinates(one.distance, ((points - one.origin) / one.spacing).T, output=float, order=1, cval=1e3)
 
 
 def labels(body: Body, points: np.ndarray) -> np.ndarray:
     """Labels : (n,): the last solid that holds a point, or 0."""
     numbers = np.arange(1, len(body.solids) + 1)[:, None]
-    return ((distances(body, points) < 0) * numbers).max(axis=0)
+    return ((distances(body, points) <= 0) * numbers).max(axis=0)
 
 
 def distance_to(body: Body, solids: np.ndarray, points: np.ndarray) -> np.ndarray:

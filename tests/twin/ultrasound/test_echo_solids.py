@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from recon.errors import InputError
+from recon.geometry import rigid
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from scenes.acoustics import TISSUES, faster
 from scenes.catalogue import build_scene
@@ -30,6 +31,53 @@ def test_a_meshs_distance_is_that_of_the_shape(rng):
         assert distances(made, radius * way) == pytest.approx(np.full(500, radius - 15.0), abs=0.03)
     assert (distances(made, 5.0 * way) < 0).all()
     assert (distances(made, 17.9 * way) > 0).all()
+
+
+BOX = trimesh.creation.box((40.0, 40.0, 20.0))
+TURN = rigid.from_rotation_vector([0.2, 0.3, 0.1], [5.0, -3.0, 60.0])
+
+
+def to_box(points):
+    """Signed distances to BOX: by the nearest point of it, inside by the nearest face."""
+    beyond = np.abs(points) - [20.0, 20.0, 10.0]
+    return np.where((beyond > 0).any(axis=1), np.linalg.norm(np.maximum(beyond, 0), axis=1), beyond.max(axis=1))
+
+
+def test_a_boxs_distance_is_exact_at_its_edges_too(rng):
+    made = solid(Thing("block", BOX, Material(0.5)), TISSUES["silicone"], None)
+    near_edges = np.array([20.0, 20.0, 10.0]) * rng.choice([-1, 1], (300, 3)) + rng.uniform(-2, 2, (300, 3))
+    assert distances(made, near_edges) == pytest.approx(to_box(near_edges), abs=1e-12)
+    assert made.distances(near_edges) == pytest.approx(to_box(near_edges), abs=1e-12)
+    assert distances(made, [(20.0, 3.0, 10.0), (19.5, 3.0, 10.0), (70.0, 0.0, 0.0)]) == pytest.approx([0.0, 0.0, 50.0], abs=1e-12)
+
+
+def test_a_turned_boxs_distance_is_that_of_its_faces_however_few_its_vertices(rng):
+    """Twelve facets: exact off the edges, where a plane's distance is linear; a cell's half diagonal off at most beside them."""
+    turned = BOX.copy()
+    turned.apply_transform(TURN)
+    made = solid(Thing("block", turned, Material(0.5)), TISSUES["silicone"], None)
+    points = rng.uniform((-22.0, -22.0, -12.0), (22.0, 22.0, 12.0), (4000, 3))
+    true, found = to_box(points), distances(made, rigid.apply(TURN, points))
+    _, second, first = np.sort(np.abs(points) - [20.0, 20.0, 10.0], axis=1).T
+    one_face = (np.abs(first) < 2.0) & (second < np.minimum(first, 0.0) - 1.0)  # for all points of a cell
+    assert np.abs(found - true)[one_face].max() < 1e-5
+    assert np.abs(found - true)[np.abs(true) < 2.0].max() < 0.5 * np.sqrt(3) / 2
+    assert ((found < 0) == (true < 0))[np.abs(true) > 0.4].all()
+
+
+def test_a_hollow_meshs_hole_is_outside():
+    """A ring, on its axis, within its wall, and beside it."""
+    ring = Thing("ring", trimesh.creation.annulus(5.0, 15.0, 20.0), Material(0.5))
+    made = solid(ring, TISSUES["silicone"], None)
+    assert distances(made, [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (4.0, 0.0, 0.0), (16.0, 0.0, 0.0)]) == pytest.approx(
+        [3, -3, 1, 1], abs=0.05
+    )
+
+
+def test_an_open_mesh_is_refused():
+    opened = trimesh.Trimesh(BOX.vertices, BOX.faces[BOX.face_normals[:, 2] < 0.5])  # whose volume trimesh gives as a box's
+    with pytest.raises(InputError, match="scene: bowl: expected a closed mesh, found open edges"):
+        solid(Thing("bowl", opened, Material(0.5)), TISSUES["silicone"], None)
 
 
 def test_a_rods_wall_is_where_it_is(rng):
