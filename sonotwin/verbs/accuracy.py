@@ -5,12 +5,14 @@ recordings where `real` names their folder. Writes into the folder `out` results
 settings, value, bar, limit, unit, day and commit, and pictures; figures of the same code and settings are kept in OUT/kept/
 with the day and the commit of their measurement, from which a run goes on that was stopped; times and the like are measured
 each time. With `document=docs/accuracy.md` the group's rows are replaced in docs/accuracy.csv, and the page's table is made
-of all rows there by conf/bars/accuracy.yaml. Takes some minutes a group, and about an hour for tracking, for which a
+of all rows there by conf/bars/accuracy.yaml. What needs recordings, or a virtual screen, and has none is left out with a line
+that says so, and its rows stay as they are. Takes some minutes a group, and about an hour for tracking, for which a
 thousand pairs of frames are rendered, an hour for studies and three hours for sessions. Exit status 1 if a bar is missed.
 
     sonotwin accuracy only=optics
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -70,15 +72,21 @@ def run(config: Config) -> int:
     console = LineConsole()
     met = True
     for group in groups:
-        measured = []
+        measured, left_out = [], [one for one in asked[group] if one.lacks(setup)]
+        for one in left_out:
+            console.print(f"left out {one.of}: it needs {one.lacks(setup)}; rows of earlier runs stay", markup=False)
         for row in bars.measure(asked[group], setup, kept, config.engine):
             verdict = {None: "    ", True: "ok  ", False: "MISS"}[row.met]
             bar = "" if row.bar is None else f" (bar {row.bar:.4g})"
             console.print(f"{verdict} {row.what}: {row.measured:.4g} {row.unit}{bar}", markup=False)
             measured.append(row)
-        result_rows.write_table(table, group, measured)
+
+        def stays(what: str, left_out: Sequence[bars.Experiment] = left_out) -> bool:
+            return any(one.gives(what) for one in left_out)
+
+        result_rows.write_table(table, group, measured, stays)
         if config.document:
-            result_rows.enter(config.document, shown, group, measured)
+            result_rows.enter(config.document, shown, group, measured, stays)
         console.print(f"wrote {table}", markup=False)
         met &= all(row.met is not False for row in measured)
     return 0 if met else 1

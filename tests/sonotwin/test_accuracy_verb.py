@@ -7,6 +7,7 @@ import pytest
 from sonotwin.cli import main
 from twin.experiments import bars, result_rows
 from twin.experiments.bars import Experiment, Figure
+from twin.experiments.result_rows import Row
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,6 +45,27 @@ def test_rows_are_written_and_missed_bars_told(quick, value, status, tmp_path, c
     assert str(rest) == str([row for row in others if row.group != "optics"])
     assert (f"| an error | optics | {value} mm | <= 0.05 |  |  | **no** |" in page.read_text()) == (status == 1)
     assert ("MISS" in capsys.readouterr().out) == (status == 1)
+
+
+def test_rows_of_recordings_stay_without_them(monkeypatch, tmp_path, capsys):
+    """With a line that says what is left out and why; a row that the entry no longer gives goes."""
+    shown, real = (
+        Figure(figure="error_mm", what=what, unit="mm") for what in ("{about}: shown", "recorded, {width:g} px: {name}")
+    )
+    ours = Experiment("optics", f"{__name__}.measured", "ours", {"value": 0.01}, {}, None, (shown,))
+    recorded = Experiment("optics", "a.b", "", {}, {"name": "off"}, "real", (real,))
+    monkeypatch.setattr(bars, "read", lambda path: [ours, recorded])
+    page = tmp_path / "page.md"
+    page.write_text("<!-- rows -->\n<!-- /rows -->\n")
+    old = [
+        Row("optics", what, 3.0, "", None, None, "mm", None)
+        for what in ("recorded, 640 px: off", "recorded: none", "ours: shown")
+    ]
+    result_rows.write(page.with_suffix(".csv"), old)
+    assert main(["accuracy", "only=optics", f"out={tmp_path / 'out'}", f"document={page}"]) == 0
+    rows = result_rows.read(page.with_suffix(".csv"))
+    assert [(row.what, row.measured) for row in rows] == [("recorded, 640 px: off", 3.0), ("ours: shown", 0.01)]
+    assert "left out a.b: it needs recordings, as real=FOLDER; rows of earlier runs stay" in capsys.readouterr().out
 
 
 def test_a_broken_file_of_rows_is_refused_first(quick, tmp_path, capsys):

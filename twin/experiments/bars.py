@@ -6,6 +6,7 @@ accuracy, and one of speed, is a list of such entries in `conf/bars/`.
 
 import itertools
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -41,6 +42,20 @@ class Known(dict[str, Any]):
         return super().__getitem__(name)
 
 
+class _Unmeasured(dict[str, Any]):
+    """Names in a text, of figures that nobody has measured, too."""
+
+    def __missing__(self, name: str) -> "_Number":
+        return _Number()
+
+
+class _Number(float):
+    """A number in a text, which may become any."""
+
+    def __format__(self, form: str) -> str:
+        return "\0"
+
+
 class Figure(Part):
     """A figure's row; texts may have `{name}` of settings, of `each`, of figures, and `{about}` of the entry."""
 
@@ -67,22 +82,39 @@ class Figure(Part):
 
     def rows(self, experiment: "Experiment", figures: Figures, used: set[str]) -> Iterator[Row]:
         """The rows of measured figures; notes the names that they use."""
-        for values in zip(*self.each.values(), strict=True) if self.each else [()]:
-            given = {**figures, **experiment.settings, **experiment.words, **dict(zip(self.each, values, strict=True))}
-            known = Known(given, used)
+        for given in self._given(experiment):
+            names = set[str]()
+            known = Known({**figures, **given}, names)
             known["about"] = experiment.about.format_map(known)
             name = self.figure.format_map(known)
-            used.add(name)
+            used |= names | {name}
             if self.optional and name not in figures:
                 continue
             asked, limit = (_number(number, known) for number in (self.most if self.least is None else self.least, self.limit))
             sense, measured = "" if asked is None else "<=" if self.least is None else ">=", float(figures[name])
+            for two in sorted(names & given.keys() & figures.keys()):
+                if given[two] != figures[two]:
+                    found = f"{given[two]} of the entry and {figures[two]} measured"
+                    raise InputError(f"{experiment.place}: {self.figure}: {two}: expected one value, found {found}; rename one")
+            used |= names
             met = None if asked is None else bool(measured <= asked if sense == "<=" else measured >= asked)
             settings = json.dumps(experiment.settings, sort_keys=True)
             yield Row(
                 *(experiment.group, self.what.format_map(known), measured, sense, asked, limit, self.unit, met),
                 **{"experiment": experiment.of, "settings": settings, "figure": name},
             )
+
+    def texts(self, experiment: "Experiment") -> Iterator[re.Pattern[str]]:
+        """What the texts of its rows may be, whatever the figures are."""
+        for given in self._given(experiment):
+            known = _Unmeasured(given)
+            known["about"] = experiment.about.format_map(known)
+            yield re.compile(re.escape(self.what.format_map(known)).replace("\0", r"([-+.\de]+|nan|inf)"))
+
+    def _given(self, experiment: "Experiment") -> Iterator[dict[str, Any]]:
+        """What a row's names stand for before anything is measured, row by row."""
+        for values in zip(*self.each.values(), strict=True) if self.each else [()]:
+            yield {**experiment.settings, **experiment.words, **dict(zip(self.each, values, strict=True))}
 
 
 class Entry(Part):
@@ -122,9 +154,15 @@ class Experiment:
         module, _, name = self.of.rpartition(".")
         return getattr(import_module(module), name)
 
-    def at_hand(self, setup: Setup) -> bool:
-        """Whether what it needs is there."""
-        return {None: True, "real": setup.real is not None, "screen": bool(virtual_screen.installed())}[self.needs]
+    def lacks(self, setup: Setup) -> str:
+        """Name what it needs that isn't there; empty if all is."""
+        if self.needs == "real" and setup.real is None:
+            return "recordings, as real=FOLDER"
+        return "a virtual screen, as Xvfb" if self.needs == "screen" and not virtual_screen.installed() else ""
+
+    def gives(self, what: str) -> bool:
+        """Whether a row's text is one of its."""
+        return any(text.fullmatch(what) for figure in self.figures for text in figure.texts(self))
 
     def keeps(self) -> bool:
         """Whether its figures depend on code, settings and inputs alone; commands' own experiments keep their parts."""
@@ -176,11 +214,11 @@ def read(path: Path) -> list[Experiment]:
 
 
 def measure(experiments: Sequence[Experiment], setup: Setup, kept: Kept | None, engine: Engine) -> Iterator[Row]:
-    """Measure what can be measured, and give the rows in the order of the file as soon as they are there.
+    """Measure what lacks nothing, and give the rows in the order of the file as soon as they are there.
 
     kept : for experiments that keep their figures; its state is that of the rows, of kept ones the state that they were kept with
     """
-    there = [one for one in experiments if one.at_hand(setup)]
+    there = [one for one in experiments if not one.lacks(setup)]
     keys = {id(one): one.key(setup) for one in there if one.keeps()} if kept else {}
     tasks = {keys[id(one)]: (one, setup) for one in there if id(one) in keys}
     for key, (one, _) in tasks.items():

@@ -7,7 +7,7 @@ in a folder of results they stand in one tidy Parquet file, with experiment and 
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -23,6 +23,7 @@ from twin.experiments import document_tables
 MARK = "rows"  # of the short table's place in a document
 TABLE = "results.parquet"
 COLUMNS = 10  # of the CSV file: a row's first fields
+Stays = Callable[[str], bool]  # whether a row of a text, which this run couldn't measure, stays as it was
 
 
 @dataclass(frozen=True)
@@ -135,10 +136,10 @@ def read_table(path: Path) -> list[Row]:
         raise InputError(f"{path}: expected results of `sonotwin accuracy`, found {reason}; another `out`?") from error
 
 
-def write_table(path: Path, group: str, measured: Sequence[Row]) -> None:
-    """Replace a group's rows in a Parquet file, with all digits."""
+def write_table(path: Path, group: str, measured: Sequence[Row], stays: Stays = lambda what: False) -> None:
+    """Replace a group's rows in a Parquet file, with all digits, but for those that stay."""
     with atomic.new_file(path) as temporary:
-        records = [asdict(row) for row in renewed(read_table(path), group, measured)]
+        records = [asdict(row) for row in renewed(read_table(path), group, measured, stays)]
         pq.write_table(pa.Table.from_pylist(records, schema=SCHEMA), temporary)
 
 
@@ -151,14 +152,16 @@ SCHEMA = pa.schema(
 )
 
 
-def enter(document: Path, choices: Sequence[Chosen], group: str, measured: Sequence[Row]) -> None:
-    """Replace a group's rows in the file beside a document, and make the document's table anew.
+def enter(
+    document: Path, choices: Sequence[Chosen], group: str, measured: Sequence[Row], stays: Stays = lambda what: False
+) -> None:
+    """Replace a group's rows in the file beside a document, but for those that stay, and make the document's table anew.
 
     The file is locked from reading to writing, so that two processes that enter different groups lose none.
     """
     path = file_of(document)
     with atomic.new_file(path) as temporary:
-        rows = renewed(read(path), group, measured)
+        rows = renewed(read(path), group, measured, stays)
         write(temporary, rows)
         document_tables.enter(document, MARK, short_table(rows, choices))
 
@@ -168,11 +171,15 @@ def show(document: Path, choices: Sequence[Chosen]) -> None:
     document_tables.enter(document, MARK, short_table(read(file_of(document)), choices))
 
 
-def renewed(rows: Sequence[Row], group: str, measured: Sequence[Row]) -> list[Row]:
-    """Rows with those of a group replaced where they stood; a new group comes last."""
+def renewed(rows: Sequence[Row], group: str, measured: Sequence[Row], stays: Stays = lambda what: False) -> list[Row]:
+    """Rows with those of a group replaced where they stood, but for those that stay, behind the same row; a new group last."""
     place = next((k for k, row in enumerate(rows) if row.group == group), len(rows))
-    before = [row for row in rows[:place] if row.group != group]
-    return [*before, *measured, *(row for row in rows[place:] if row.group != group)]
+    before, former, new = [row for row in rows[:place] if row.group != group], "", list(measured)
+    for row in (row for row in rows if row.group == group):
+        if stays(row.what):
+            new.insert(next((k + 1 for k, other in enumerate(new) if other.what == former), len(new) if former else 0), row)
+        former = row.what
+    return [*before, *new, *(row for row in rows[place:] if row.group != group)]
 
 
 def read_choices(path: Path) -> list[Chosen]:

@@ -51,6 +51,17 @@ def test_a_group_is_replaced_where_it_stood():
     assert result_rows.renewed(ROWS[:2], "two", ROWS[2:]) == ROWS
 
 
+def test_rows_that_stay_keep_their_places():
+    """Behind the row that they stood behind, or first."""
+    old = [replace(ROWS[0], what=what, measured=1.0) for what in "abcd"]
+    new = [replace(row, measured=2.0) for row in (old[0], old[2])]
+    for stay, expected in (("b", "abc"), ("bd", "abcd"), ("", "ac")):
+        found = result_rows.renewed([*old, *ROWS[2:]], old[0].group, new, stay.__contains__)
+        assert "".join(row.what for row in found[: len(expected)]) == expected and found[len(expected) :] == ROWS[2:]
+        assert {row.what for row in found[: len(expected)] if row.measured == 1.0} == set(stay)
+    assert [row.what for row in result_rows.renewed(old, old[0].group, new[1:], "a".__contains__)] == ["a", "c"]
+
+
 def test_groups_that_are_entered_at_once_lose_none(tmp_path):
     """As when two commands measure different groups into one document."""
     page = tmp_path / "page.md"
