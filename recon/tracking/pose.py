@@ -29,6 +29,7 @@ SIZES = 0.12  # of a disc's size, by which shapes may differ from the pose's
 SIZES_ALONE = 0.05  # the same of one view by itself: three rings of a sheet were 14 % off, targets 0.5 % in the median
 SIGMAS = 3.0  # standard deviations that are added to what sizes may differ by
 DISTINCT = 16.0  # least excess of another pose's misfit, with shapes
+UNTOLD = "two poses that the circles seen do not tell apart"
 SAME = 16.0  # squared standard deviations within which two poses are one
 
 
@@ -94,7 +95,7 @@ def _fits(views: tuple[Sighting, Sighting], target: Target, optics: Uncertainty 
 
 def exchanged(first: Sighting, second: Sighting, target: Target, optics: Uncertainty | None = None) -> bool:
     """Whether two views that give no pose give one as each other's: of cameras of which the frames, or names, are exchanged."""
-    crossed = replace(first, camera=second.camera), replace(second, camera=first.camera)
+    crossed = replace(second, camera=first.camera), replace(first, camera=second.camera)  # as `optics` has camera 1's first
     return estimate(*crossed, target, optics).found
 
 
@@ -132,7 +133,7 @@ def _chosen(fits: Sequence[TargetPose], views: Sequence[Sighting], target: Targe
         turn = np.degrees(np.sqrt(np.trace(good[best].total[:3, :3])))
         return lost(f"views that leave the target's turn uncertain: by {turn:.1f} deg", good[best].misfit)
     if not all(same(good[best], rival) for rival in rivals):
-        return lost("two poses that the circles seen do not tell apart")
+        return lost(UNTOLD)
     return good[best]
 
 

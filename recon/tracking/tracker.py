@@ -7,7 +7,6 @@ of sizes against distances, and of both views against each other; so what is wro
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from time import perf_counter
 
 import numpy as np
@@ -27,7 +26,7 @@ from recon.tracking.circle_detector import Window
 from recon.tracking.frames import grey
 from recon.tracking.identity import Naming
 from recon.tracking.networks import Networks
-from recon.tracking.pose import estimate, exchanged, same
+from recon.tracking.pose import DISTINCT, UNTOLD, estimate, exchanged, same
 from recon.tracking.pose_fit import Sighting, TargetPose, lost
 from recon.tracking.rims import Outlines, measure, measure_both, reach_px
 from recon.tracking.views import View
@@ -101,13 +100,22 @@ class Tracker:
     _looked: float | None = field(default=None, init=False)  # when a second target was looked for
     _missed: int = field(default=0, init=False)  # frames since then
     _clock: float = field(default=0.0, init=False)  # counts frames that come without a time
+    _used: tuple[tuple, Uncertainty | None] | None = field(
+        default=None, init=False, repr=False
+    )  # settings, and what follows of them
 
-    @cached_property
+    @property
     def optics_in_use(self) -> Uncertainty | None:
         """Uncertainty of the cameras as they are now: of their calibration, and by drift and the board's scale since."""
-        return in_use(self.optics, dict(zip(CAMERAS, self.cameras, strict=True)), self.board_scale, self.drift_px)
+        given = self.optics, self.cameras, self.board_scale, self.drift_px
+        if not self._used or any(one is not other for one, other in zip(given, self._used[0], strict=True)):
+            self._used = (
+                given,
+                in_use(self.optics, dict(zip(CAMERAS, self.cameras, strict=True)), self.board_scale, self.drift_px),
+            )
+        return self._used[1]
 
-    @cached_property
+    @property
     def count(self) -> int:
         """Number of the target's circles."""
         return circle_layout.count(self.target)
@@ -144,7 +152,7 @@ class Tracker:
             if self.networks is not None and self._is_due(result, now, LOOK_FRAMES if time_s is None else LOOK_S):
                 result, self._looked = self._nearest(result, self._beside(frames, self.networks, result)), now
                 watch.stop("look")
-            self.remember(result.pose.world_from_target, now)
+            self._keep(result.pose.world_from_target, now, limit)
             self._last = result.pose.world_from_target
             self._disc_px = min(views.diameter(view.outlines.ellipses) for view in result.views)
         else:
@@ -163,10 +171,13 @@ class Tracker:
             return result
         return replace(result, pose=replace(result.pose, reason=views.unseen(changed)), views=changed)
 
-    def remember(self, world_from_target: Array, time_s: float) -> None:
-        """Take a pose as known, of a time in s, or of the frame counted so."""
-        steady = self._past and 0 < time_s - self._past[-1][0] <= (FORGOTTEN_S if time_s != self._clock else FORGOTTEN_FRAMES)
-        self._past = [*(self._past[-1:] if steady else []), (time_s, world_from_target)]
+    def remember(self, world_from_target: Array, time_s: float | None = None) -> None:
+        """Take a pose as known, of a time in s, or of the last frame where frames come without times."""
+        self._keep(world_from_target, *((self._clock, FORGOTTEN_FRAMES) if time_s is None else (time_s, FORGOTTEN_S)))
+
+    def _keep(self, world_from_target: Array, now: float, limit: float) -> None:
+        steady = self._past and 0 < now - self._past[-1][0] <= limit
+        self._past = [*(self._past[-1:] if steady else []), (now, world_from_target)]
 
     def forget(self) -> None:
         """Clear the last poses."""
@@ -369,7 +380,7 @@ class Tracker:
                 others = self._opposite_views(frames, k, view)
                 results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
-                    return min((one for one in results if one.found), key=_rank)
+                    return _likeliest(results)
                 likeliest.update((1 - k, other) for other in others if other.found)
         first, second = (likeliest.get(k, views.absent(count, self.count)) for k, count in enumerate(counts))
         return views.in_light(first, frames[0]), views.in_light(second, frames[1])
@@ -412,6 +423,18 @@ class _Watch:
 def _rank(result: Tracking) -> tuple[int, float]:
     """To find the right tilt first: a wrong one misses circles, or else fits worse."""
     return -result.pose.freedom, result.pose.misfit
+
+
+def _likeliest(results: Sequence[Tracking]) -> Tracking:
+    """Of results by several hypotheses the one found that ranks first; none if another pose fits as many circles as well."""
+    best, *others = sorted((one for one in results if one.found), key=_rank)
+    rivals = [
+        one.pose for one in others if one.pose.freedom == best.pose.freedom and one.pose.misfit < best.pose.misfit + DISTINCT
+    ]
+    if all(same(best.pose, rival) for rival in rivals):
+        return best
+    pose = lost(UNTOLD)
+    return Tracking(pose, views.doubted(best.views, pose.reason))
 
 
 def _shown(view: View) -> tuple[bool, int]:

@@ -299,6 +299,18 @@ def test_swapped_cameras_are_noticed(cameras, target, rng):
         assert not pose.estimate(*swapped, target).found
 
 
+def test_exchanged_cameras_keep_the_uncertainty_of_their_calibrations(cameras, target):
+    """Camera 1's principal point is 3 px off, as its calibration allows; camera 2, of a long lens, is exact."""
+    optics = Uncertainty(("cam1.cy",), np.array([[4.0]]))
+    wide, long = (
+        replace(camera, matrix=np.diag([scale, scale, 1]) @ camera.matrix) for camera, scale in zip(cameras, (1, 6), strict=True)
+    )
+    moved = replace(wide, matrix=wide.matrix + np.array([[0, 0, 0], [0, 0, 3.0], [0, 0, 0]]))
+    one, other = seen((moved, long), target, drawings.facing(np.random.default_rng(1)))
+    assert pose.estimate(replace(one, camera=wide), other, target, optics).found
+    assert pose.exchanged(replace(other, camera=wide), replace(one, camera=long), target, optics)
+
+
 def test_a_centre_that_is_off_is_noticed(cameras, target, rng):
     """By half a pixel, 17 times what it is known to be."""
     first, second = seen(cameras, target, drawings.facing(rng), rng)

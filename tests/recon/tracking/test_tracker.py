@@ -239,7 +239,7 @@ def test_a_lost_target_has_its_true_reason(tracker, pair):
     gone, aside = [np.full_like(image, 20) for image in pair], FACING.copy()
     assert tracker.step(*pair).found
     aside[0, 3] -= 120
-    tracker.remember(aside, tracker._clock)
+    tracker.remember(aside)
     assert "camera 1: out of view: c" in str(tracker.step(*gone).pose.reason)
     tracker.forget()
     assert "too dark" in str(tracker.step(*gone).pose.reason)
@@ -287,7 +287,7 @@ def test_images_without_a_target_are_not_found(tracker, pair, rng, kind):
     }
     seen = tracker.step(images[kind], images[kind])
     assert not seen.found and seen.pose.reason
-    tracker.remember(FACING, tracker._clock)
+    tracker.remember(FACING)
     seen = tracker.step(images[kind], images[kind])
     assert not seen.found and np.isnan(seen.pose.world_from_target).all()
 
@@ -315,6 +315,40 @@ def test_cameras_that_have_warmed_see_the_target_by_default(cameras, rig, pair, 
     assert found.found == (drift_px is None), found.pose.reason
 
 
+def test_a_setting_that_is_changed_counts_from_then_on(cameras, rig):
+    tracker = Tracker(cameras, rig.target, drift_px=0.05)
+    first = tracker.optics_in_use
+    assert first.sigma("cam1.cx") == pytest.approx(0.05) and tracker.optics_in_use is first
+    tracker.drift_px = 0.5
+    assert tracker.optics_in_use.sigma("cam1.cx") == pytest.approx(0.5)
+
+
+def test_a_pose_that_is_remembered_has_the_unit_of_time_that_it_is_given_in(cameras, rig):
+    """Poses of two frames give a velocity, of half a second apart none, of whatever number."""
+    tracker, moved = Tracker(cameras, rig.target), FACING.copy()
+    moved[0, 3] += 5
+    tracker._clock = 3.0
+    tracker.remember(FACING)
+    tracker._clock = 4.0
+    tracker.remember(moved)
+    assert tracker._predicted(5.0)[0, 3] == pytest.approx(FACING[0, 3] + 10)
+    tracker.forget()
+    tracker.remember(FACING, 3.5)
+    tracker.remember(moved, 4.0)  # the number of the frame, but in seconds
+    assert tracker._predicted(4.1)[0, 3] == moved[0, 3]
+
+
+def test_two_poses_that_fit_as_well_are_no_detection(tracker, pair):
+    """As of rims that are already measured; a worse one, or one by fewer circles, is no rival."""
+    found = tracker.step(*pair)
+    turned = rigid.from_rotation_vector([0.3, 0, 0], [0, 0, 0])
+    other = replace(found.pose, world_from_target=found.pose.world_from_target @ turned)
+    worse, fewer = replace(other, misfit=found.pose.misfit + 17), replace(other, freedom=found.pose.freedom - 2)
+    for pose, told in ((other, False), (worse, True), (fewer, True), (found.pose, True)):
+        result = tracking._likeliest([replace(found, pose=pose), found])
+        assert result.found == told and (told or "do not tell apart" in result.pose.reason)
+
+
 def test_colour_and_depth_make_no_difference(cameras, rig, pair, told):
     deep = [(image.astype(np.uint16) * 16).clip(0, 4095) for image in pair]
     for images in ([np.repeat(i[..., None], 3, axis=2) for i in pair], deep, [i.astype(np.float32) / 255 for i in pair]):
@@ -325,7 +359,7 @@ def test_colour_and_depth_make_no_difference(cameras, rig, pair, told):
 def test_without_networks_it_says_so(cameras, rig, pair):
     lonely = Tracker(cameras, rig.target)
     assert "no networks" in str(lonely.step(*pair).pose.reason)
-    lonely.remember(FACING, lonely._clock)
+    lonely.remember(FACING)
     assert lonely.step(*pair).how == "predicted"
 
 
