@@ -14,6 +14,7 @@ from scipy.constants import c as LIGHT_SPEED
 from scipy.constants import h as PLANCK
 
 from recon.compiled import kernel, njit
+from recon.errors import InputError
 from recon.model.rig import CameraDevice, Sensor
 from recon.threads import mapped
 
@@ -25,11 +26,25 @@ Numbers = NDArray[np.uint8] | NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class Exposure:
-    """Settings of a shot."""
+    """Settings of a shot.
+
+    Raises
+    ------
+    InputError
+        If one is out of its range.
+    """
 
     time_s: float
     gain: float = 1.0  # 1 fills the ADC's range with `saturation_e` electrons
-    bits: Literal[8, 10, 12] = 8  # of the image; at most the ADC's
+    bits: Literal[8, 10, 12] = 8  # of the image; at most the ADC's, see `dropped_bits`
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.time_s < np.inf:
+            raise InputError(f"exposure: time_s: expected a time from 0, found {self.time_s:g}")
+        if not 0 < self.gain < np.inf:
+            raise InputError(f"exposure: gain: expected more than 0, found {self.gain:g}; it is linear, not in dB")
+        if self.bits not in (8, 10, 12):
+            raise InputError(f"exposure: bits: expected 8, 10 or 12, found {self.bits}")
 
 
 def electrons_per_radiance(device: CameraDevice, wavelength_nm: float) -> float:
@@ -48,9 +63,15 @@ def auto_exposure(
 ) -> float:
     """Exposure time in s, to the microsecond, that brings the brightest image's percentile to a level of full scale at gain 1.
 
+    Each fourth pixel along rows and columns counts; where too few are lit for the percentile, the brightest pixel does.
+
     radiance : (n, h, w), W/mm^2/sr. A scene without light gets 1 s.
     """
-    brightest = max(float(np.percentile(image[::4, ::4], percentile)) for image in radiance)
+    brightest, peak = 0.0, 0.0
+    for image in radiance:
+        brightest = max(brightest, float(np.percentile(image[::4, ::4], percentile)))
+        peak = max(peak, float(image.max()))
+    brightest = brightest or peak
     if brightest <= 0:
         return 1.0
     seconds = level * device.sensor.saturation_e / (brightest * electrons_per_radiance(device, wavelength_nm))
@@ -113,9 +134,16 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
     return numbers
 
 
+def dropped_bits(sensor: Sensor, exposure: Exposure) -> int:
+    """Least significant bits of the ADC that an image leaves out; raises InputError if the image has more than the ADC."""
+    if exposure.bits > sensor.adc_bits:
+        raise InputError(f"exposure: bits: expected at most the {sensor.adc_bits} of the sensor's ADC, found {exposure.bits}")
+    return sensor.adc_bits - exposure.bits
+
+
 def readout_of(device: CameraDevice, wavelength_nm: float, exposure: Exposure) -> Readout:
     """Of a camera."""
-    sensor, dropped = device.sensor, device.sensor.adc_bits - exposure.bits
+    sensor, dropped = device.sensor, dropped_bits(device.sensor, exposure)
     return Readout(
         np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s),
         np.float32(sensor.dark_current_e_per_s * exposure.time_s),
@@ -186,7 +214,7 @@ def number_per_electron(sensor: Sensor, exposure: Exposure) -> float:
 
 def digitise(electrons: Images, sensor: Sensor, exposure: Exposure) -> Numbers:
     """Electrons to digital numbers: gain, black level, clipping, ADC, and the image's most significant bits."""
-    dropped = sensor.adc_bits - exposure.bits
+    dropped = dropped_bits(sensor, exposure)
     counts = sensor.black_level_dn * 2 ** (sensor.adc_bits - 8) + electrons * np.float32(
         number_per_electron(sensor, exposure) * 2**dropped
     )

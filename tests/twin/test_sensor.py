@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from recon.errors import InputError
 from twin.sensor import (
     SMOOTHING_E,
     Exposure,
@@ -86,6 +87,26 @@ def test_auto_exposure(rig, rng):
     time_s = auto_exposure(radiance, rig.cam1, WAVELENGTH, level=0.8, percentile=99)
     images = expose(radiance, rig.cam1, WAVELENGTH, Exposure(time_s), seed=1)
     assert np.percentile(images, 99) / 255 == pytest.approx(0.8, abs=0.03)
+
+
+def test_a_small_spot_in_the_dark_is_exposed_for(rig):
+    """Less than the percentile leaves, and between the pixels that count: its peak comes to the level, instead of 1 s."""
+    radiance = np.zeros((2, 64, 64), np.float32)
+    radiance[1, 21:23, 21:23] = 2e-7
+    images = expose(radiance, rig.cam1, WAVELENGTH, Exposure(auto_exposure(radiance, rig.cam1, WAVELENGTH, level=0.8)), seed=1)
+    assert images[1, 21:23, 21:23].mean() / 255 == pytest.approx(0.8, abs=0.05)
+    assert auto_exposure(0 * radiance, rig.cam1, WAVELENGTH) == 1.0
+
+
+def test_settings_that_no_shot_has_are_refused(rig):
+    """Twelve bits of a ten-bit ADC were shifted the wrong way before."""
+    for wrong, named in (((-1.0,), "time_s"), ((float("nan"),), "time_s"), ((0.01, 0.0), "gain"), ((0.01, 1.0, 9), "bits")):
+        with pytest.raises(InputError, match=f"exposure: {named}: expected"):
+            Exposure(*wrong)
+    with pytest.raises(InputError, match="bits: expected at most the 10 of the sensor's ADC, found 12"):
+        shots(rig.cam1, 1e-7, count=1, bits=12)
+    with pytest.raises(InputError, match="bits: expected at most the 10 of the sensor's ADC, found 12"):
+        digitise(np.zeros((2, 2), np.float32), rig.cam1.sensor, Exposure(0.01, bits=12))
 
 
 def test_seed_decides_and_cameras_differ(rig):

@@ -18,7 +18,7 @@ from twin.board_session import CAMERAS
 from twin.devices.shown_light import Pattern
 from twin.devices.virtual_clock import VirtualClock
 from twin.optics.surface_session import CameraName
-from twin.sensor import Exposure, expose
+from twin.sensor import Exposure, dropped_bits, expose
 
 TRANSFER_NS = 5_000_000  # from the end of an exposure until the image is in memory; assumed, of a camera at USB 3
 REFRESH_NS = 16_666_667  # of the projector's display, until a pattern is on as a whole
@@ -81,6 +81,7 @@ class VirtualCamera:
         self.size: Size = getattr(rig.rig, name).optics.size
         self._rig = rig
         self._exposure = Exposure(0.01, 1.0, rig.bits)  # pyrefly: ignore[bad-argument-type]
+        dropped_bits(getattr(rig.rig, name).sensor, self._exposure)  # refuses more than there are before the first frame
         self._trigger: Trigger | None = None
         self._exposed: deque[tuple[int, Pattern, Exposure]] = deque()  # middle of the exposure in ns, what was shown
         self._taken = 0  # frames since the start
