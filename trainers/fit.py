@@ -32,6 +32,7 @@ CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 WARM_UP = 0.05  # of the training, over which the learning rate rises
 LAST_RATE = 0.01  # of the highest learning rate, at the end
 CLIP = 5.0  # most of the gradient's norm
+NO_LOSS = "data: expected samples with a finite loss, found one without before the first weight changed"
 AVERAGE = 0.998  # of the averaged weights that stays in a step, once there were enough steps
 
 Precision = Literal["auto", "32-true", "bf16-mixed"]
@@ -96,9 +97,12 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     _forget_later(folder, step)
     began = written = perf_counter()
     losses: list[float] = []
+    survivable = f"learning_rate: expected one that training survives, found {plan.learning_rate:g}"
     shown = chosen(validation, np.unique(np.linspace(0, len(validation) - 1, plan.validate_at_most).round().astype(int)))
 
     def save() -> None:
+        if not all(weights.isfinite().all() for network in networks.values() for weights in network.parameters()):
+            raise InputError(f"{survivable}: weights that aren't finite after step {step}; the last checkpoint stays")
         checkpoints.write(folder / CHECKPOINT, networks, optimizer, samples, step, seconds)
         if (folder / LOG).is_file():
             atomic.list_again(folder, LOG, TRAIN)
@@ -120,7 +124,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
             seconds = before + perf_counter() - began
             losses.append(float(loss.detach()))
             if not math.isfinite(losses[-1]):
-                raise InputError(f"learning_rate: expected one that training survives, found {plan.learning_rate:g}: step {step}")
+                raise InputError(f"{survivable}: step {step}" if step > 1 else NO_LOSS)
             tell(step, progress(plan, step, seconds), losses[-1])
             if step % plan.log_steps == 0 or progress(plan, step, seconds) >= 1:
                 row = {"step": step, "seconds": round(seconds, 2), "loss": float(np.mean(losses)), "rate": rate(done)}

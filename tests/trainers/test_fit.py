@@ -12,6 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from recon.errors import InputError
 from tests.patience import PATIENCE_S
 from trainers import fit
 from trainers.architectures import Detector, Segmenter
@@ -110,6 +111,20 @@ def test_a_key_press_that_reaches_all_processes_leaves_a_checkpoint(data_set, tm
         if running.poll() is None:
             os.killpg(running.pid, signal.SIGKILL)
     assert "KeyboardInterrupt" in told and (tmp_path / fit.CHECKPOINT).is_file(), told
+
+
+def test_weights_that_are_not_finite_are_not_saved(data_set, tmp_path):
+    """Of gradients that overflow in the last step, whose loss was finite; and a loss that was none before is the data's."""
+    data = split(read_patches([data_set]), 0.1)
+    network = small("segmenter")
+    next(network.parameters()).register_hook(lambda gradient: gradient * torch.inf)
+    with pytest.raises(InputError, match=r"learning_rate: .* weights that aren't finite after step 1"):
+        fit.fit(network, *data, plan("segmenter", 1), tmp_path, lambda *_: None)
+    assert not (tmp_path / fit.CHECKPOINT).exists()
+    network = small("segmenter")
+    next(network.parameters()).data[:] = torch.nan
+    with pytest.raises(InputError, match="data: expected samples with a finite loss"):
+        fit.fit(network, *data, plan("segmenter", 1), tmp_path, lambda *_: None)
 
 
 def test_the_learning_rate_rises_falls_and_ends(data_set):
