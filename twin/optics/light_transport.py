@@ -22,7 +22,7 @@ from twin.optics.sampling import PairedPoints
 
 Images = NDArray[np.float32]
 
-LUMENS_PER_WATT = 542.0  # photopic efficacy at 525 nm (683 lm/W, CIE V = 0.793), to turn room light in lux into W/mm^2
+LUMENS_PER_WATT = 542.0  # of the room's white light, whatever the projector's colour: as of 525 nm (683 lm/W, CIE V = 0.793)
 
 
 def _power_of_two(value: int) -> int:
@@ -38,7 +38,7 @@ class Tracing(Part):
     """Settings of the path tracer."""
 
     samples: Samples = 16  # paths a pixel
-    bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector and camera; 1 is direct light
+    bounces: int = Field(default=1, ge=1, le=16)  # reflections between projector, or room, and camera; 1 is direct light
     room_lux: NotNegative = 0.0  # illuminance on an unshadowed surface, even from all sides
 
     @property
