@@ -192,8 +192,8 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
 
 def _source(verb: str, overrides: Sequence[str], field: str) -> str:
     """Where a field's value came from: the file of a choice of one's own, or else the verb's fields."""
-    group = field.partition(".")[0]
-    if any(override.lstrip("+~").startswith(f"{group}.") for override in overrides):
+    group, keys = field.partition(".")[0], [override.lstrip("+~").partition("=")[0] for override in overrides]
+    if any("." in key and (f"{field}.".startswith(f"{key}.") or key.startswith(f"{field}.")) for key in keys):
         return verb
     files = {key.rpartition("@")[2]: path for key, path in filter(None, (_own_choice(verb, each) for each in overrides))}
     return str(files.get(group, verb))
@@ -468,8 +468,12 @@ def _fitted(override: str, model: type[BaseModel] | None, known: Callable[[], An
 
 def _tag_in(value: str, tags: Collection[str]) -> tuple[str, str] | None:
     """The field that tells a thing's kind, with its value, in a map on the command line."""
-    found = re.match(rf"\{{.*?\b({'|'.join(tags)})\s*:\s*([\w-]+)", value) if tags else None
-    return None if found is None else (found[1], found[2])
+    if not tags or value[:1] != "{":
+        return None
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    given = OverridesParser.create().parse_override(f"x={value}").value()
+    return next(((tag, str(given[tag])) for tag in tags if tag in given), None) if isinstance(given, dict) else None
 
 
 def _of_kind(place: Sequence[str], model: type[BaseModel], given: Mapping[str, str]) -> list[str]:

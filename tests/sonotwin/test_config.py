@@ -150,6 +150,26 @@ def test_a_choice_may_be_a_file_of_ones_own(tmp_path_factory, tmp_path):
             load(f"rig={path}")
 
 
+def test_a_fault_in_a_file_of_ones_own_is_the_files_whatever_else_is_given(tmp_path):
+    """But one that an override has put there, at the field, above or below it, is the verb's."""
+
+    class Wide(Rig):
+        steps: int = 1
+
+    given, model = tmp_path / "mine.yaml", create_model("Model", rig=(Wide, ...), __base__=Surface)
+    given.write_text("gamma: -1\nsteps: 2\n")
+    for override, place in (("rig.steps=3", str(given)), ("rig.gamma=-2", "surface")):
+        with pytest.raises(InputError, match=rf"^{re.escape(place)}: rig.gamma: "):
+            config.load("surface", ["capture=c", f"rig={given}", override], model)
+
+
+@pytest.mark.parametrize("kind", ["video", '"video"', "'video'"])
+def test_the_kind_of_a_thing_may_stand_in_quotes(kind):
+    """In a map that replaces a thing of another kind; a map within it has a kind of its own."""
+    assert config._tag_in(f"{{kind: {kind}, source: 0}}", ["kind"]) == ("kind", "video")
+    assert config._tag_in(f"{{inner: {{kind: {kind}}}}}", ["kind"]) is None
+
+
 def test_a_choice_of_ones_own_may_start_from_a_shipped_one(tmp_path, tmp_path_factory, monkeypatch):
     """By a list of `defaults`, as Hydra has it; its own fields win. What is wrong in it is said of the file."""
     place = tmp_path_factory.mktemp("own")
