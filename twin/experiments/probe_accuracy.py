@@ -131,10 +131,10 @@ def squared_length(found: ProbeCalibration, truth: ProbeCalibration) -> float:
 
 
 @cache
-def sets(rig: Rig, frames: Frames) -> tuple[list[list[Adjustment]], list[list[ProbeCalibration]]]:
+def sets(rig: Rig, frames: Frames, repeats: int) -> tuple[list[list[Adjustment]], list[list[ProbeCalibration]]]:
     """Calibrations of all blocks, by found crossings and by true ones, each set with other errors of the poses."""
     by_images, exact = [], []
-    for repeat in range(REPEATS):
+    for repeat in range(repeats):
         rng = np.random.default_rng([1, repeat])
         by_images.append([calibrated(rig, frames.found.of(block), rng) for block in blocks(frames)])
         rng = np.random.default_rng([1, repeat])
@@ -151,7 +151,7 @@ def repeats(setup: Setup, frames: Frames | None = None) -> Figures:
     """Five calibrations agree, and are right; the limit is that of the poses' errors alone."""
     frames = frames or taken(setup)
     rig, truth = setup.rig, in_water(setup)
-    by_images, exact = sets(rig, frames)
+    by_images, exact = sets(rig, frames, REPEATS)
     found = [[each.calibration for each in one] for one in by_images]
     figures: Figures = {"set": len(found[0]), "used": np.mean([(~each.outliers).sum() for one in by_images for each in one])}
     for ending, many in (("mm", found), ("limit_mm", exact)):
@@ -177,7 +177,7 @@ def outliers(setup: Setup, frames: Frames | None = None) -> Figures:
     """The same with 30 % of the crossings anywhere, over those without; the limit is that of so many fewer frames."""
     frames = frames or taken(setup)
     rig, truth = setup.rig, in_water(setup)
-    clean = [[each.calibration for each in one] for one in sets(rig, frames)[0]]
+    clean = [[each.calibration for each in one] for one in sets(rig, frames, REPEATS)[0]]
     spoilt = []
     for repeat in range(REPEATS):
         rng, draw = np.random.default_rng([1, repeat]), np.random.default_rng([2, repeat])
@@ -240,7 +240,7 @@ def sound(setup: Setup, frames: Frames | None = None) -> Figures:
     frames = frames or taken(setup)
     rig, truth = setup.rig, calibration_of(setup.rig, setup.scanners["water"])
     speed = float(sound_in_water.speed_of_sound(TEMPERATURE_C))
-    found = [each.calibration for each in sets(rig, frames)[0][0]]
+    found = [each.calibration for each in sets(rig, frames, REPEATS)[0][0]]
     seen, sigma = sound_in_water.implied_speed(repeatability.average(found), truth.scale[1])
     predicted = float(sound_in_water.shown_too_deep(DEPTH_MM, speed))
     deep = float(sound_in_water.shown_too_deep(DEPTH_MM, seen))

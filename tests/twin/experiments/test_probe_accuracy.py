@@ -65,12 +65,11 @@ def test_a_common_error_of_crossings_is_seen_in_the_truth_only(setup):
 def test_repeats_do_not_narrow_the_interval_of_the_squared_error(setup, monkeypatch):
     """They share their images: two sets, 16 degrees of freedom, however often the poses' errors are drawn."""
     frames, low_high = exact_frames(60), []
-    once = probe_accuracy.sets.__wrapped__(setup.rig, frames)
+    once = probe_accuracy.sets(setup.rig, frames, 1)
     for name, (found, *_) in zip(("calibrated", "calibrated_exactly"), (one[0] for one in once), strict=True):
         monkeypatch.setattr(probe_accuracy, name, lambda *_, found=found: found)
     for repeats in (1, 3):
         monkeypatch.setattr(probe_accuracy, "REPEATS", repeats)
-        probe_accuracy.sets.cache_clear()
         rows = asked.rows(probe_accuracy.repeats, probe_accuracy.repeats(setup, frames))[-2:]
         assert all(f"{2 * repeats} calibrations of 2 sets" in row.what for row in rows)
         low_high.append([row.bar for row in rows])
