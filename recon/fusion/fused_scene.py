@@ -33,8 +33,19 @@ class FusedScene:
     target: Target
     skin: trimesh.Trimesh | None = None
     rest: trimesh.Trimesh | None = None  # table and background
-    masses: Mapping[str, FoundMass] = field(default_factory=dict)
+    masses: Mapping[str, FoundMass] | None = None  # None where none were looked for, or the search failed
     devices: Mapping[str, Camera] = field(default_factory=dict)
+    search_failed: str = ""  # why the search for masses failed
+
+    @property
+    def search(self) -> str:
+        """Outcome of the search for masses, as a sentence."""
+        if self.search_failed:
+            return f"The search for masses failed, so there may be some ({self.search_failed})."
+        if self.masses is None:
+            return "Masses were not looked for."
+        count = len(self.masses)
+        return f"Masses were looked for: {count or 'none'} {'was' if count < 2 else 'were'} found."
 
     @property
     def middle(self) -> int | None:
@@ -56,7 +67,7 @@ def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
         made["skin"] = surface_layer(scene.skin, IN_SPACE.skin, GREY_SKIN)
     if scene.rest is not None:
         made["table"] = surface_layer(scene.rest, IN_SPACE.table, GREY_TABLE)
-    made |= {name: painted(mass.mesh, IN_SPACE.mass) for name, mass in scene.masses.items()}
+    made |= {name: painted(mass.mesh, IN_SPACE.mass) for name, mass in (scene.masses or {}).items()}
     for k in evenly(list(scene.images), scans):
         made[f"scan{k:04d}"] = scan_layer(scene.images[k], scene.scans.world_from_pixel[k])
     if len(scene.path) > 1:

@@ -36,12 +36,15 @@ def write(path: Path, scene: FusedScene, title: str) -> None:
 
 def opening(scene: FusedScene, title: str) -> Opening:
     """The top of the page."""
-    count = len(scene.masses)
-    masses = f"{count} mass{'' if count == 1 else 'es'}" if count else "no masses"
+    count = len(scene.masses or {})
+    masses = f"{count} mass{'' if count == 1 else 'es'}" if count else "B-scans"
     parts = f"the skin by light and {masses}" if scene.skin is not None else masses
     said = f"{parts[:1].upper()}{parts[1:]} by ultrasound lie in one frame, that of camera 1, as they were measured."
+    said += "" if count else f" {scene.search}"
     poses = ("B-scans with a pose", str(scene.scans.placed), f"of {len(scene.scans.world_from_pixel)}")
-    return Opening("sonotwin scene", title, said, [poses, ("masses", str(count), "")])
+    unsaid = "the search failed" if scene.search_failed else "not looked for"
+    tile = ("masses", UNKNOWN, unsaid) if scene.masses is None else ("masses", str(count), "")
+    return Opening("sonotwin scene", title, said, [poses, tile])
 
 
 def in_space(scene: FusedScene) -> Section:
@@ -75,7 +78,7 @@ def _bodies(scene: FusedScene) -> Iterator[Shape]:
         if mesh is not None:
             coarse = merged(mesh, STEP_MM)
             yield Shape(name, coarse.vertices, coarse.faces, colour, opacity, greys=greys_of(coarse))
-    for name, mass in scene.masses.items():
+    for name, mass in (scene.masses or {}).items():
         coarse = merged(mass.mesh, STEP_MM / 2)
         yield Shape(name, coarse.vertices, coarse.faces, ON_PAGE.mass)
 

@@ -45,8 +45,9 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
             meshes.write_ply(folder / f"{name}.ply", mesh)
     if scene.masses:
         (folder / MARKUPS).write_text(json.dumps(markups(scene.masses), indent=1) + "\n", encoding="utf-8")
-    for name in (SCRIPT, README):
-        shutil.copyfile(TEMPLATES / f"slicer_{name}.txt", folder / name)
+    shutil.copyfile(TEMPLATES / f"slicer_{SCRIPT}.txt", folder / SCRIPT)
+    told = (TEMPLATES / f"slicer_{README}.txt").read_text(encoding="utf-8")
+    (folder / README).write_text(f"{told}\n{scene.search}\n", encoding="utf-8")
 
 
 def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
@@ -55,7 +56,7 @@ def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
         yield "skin", scene.skin
     if scene.rest is not None:
         yield "table", merged(scene.rest, STEP_MM)
-    yield from ((name, mass.mesh) for name, mass in scene.masses.items())
+    yield from ((name, mass.mesh) for name, mass in (scene.masses or {}).items())
     if len(scene.path) > 1:
         yield "path", path_layer(scene.path)
     yield from ((name, device_layer(camera)) for name, camera in scene.devices.items())

@@ -320,8 +320,9 @@ def look_inside(
     masses = steps.do(found, does, masses_step.BY, masses_step.Settings, fields, work, (), made_of)
     if settings.find == "masses":
         fields = seen | show_together(settings, lag, skin, optics, masses, voxels)
-        made_of |= {"masses": steps.digest(found), "optics": steps.digest("optics"), "volume": steps.digest(volume)}
-        does, work = "all of it in one picture", partial(scene_step.run, watch=sources.watch)
+        why = steps.failed.get(found, "")
+        made_of |= {"masses": [steps.digest(found), why], "optics": steps.digest("optics"), "volume": steps.digest(volume)}
+        does, work = "all of it in one picture", partial(scene_step.run, watch=sources.watch, search_failed=why)
         shown, files = _step_of("scene", name), (scene_step.SCENE,)
         steps.do(shown, does, scene_step.BY, scene_step.Settings, fields, work, files, made_of)
     return None

@@ -1,5 +1,6 @@
 """All that was found in one picture: the settings of the step, the step, and its files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -69,8 +70,10 @@ class Settings(Part):
         return self
 
 
-def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
+def run(settings: Settings, out: Path, watch: Watch = SILENT, search_failed: str = "") -> None:
     """Read what is given, and write the page, the layers and the folder.
+
+    search_failed : why there are no masses, where a search for them failed
 
     Raises
     ------
@@ -81,15 +84,17 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     voxels = volumes(settings)
     with watch.busy("putting it together"):
-        scene = read(settings)
+        scene = replace(read(settings), search_failed=search_failed)
         made = fused_scene.layers(scene, settings.scans)
     with watch.busy("writing"), atomic.new_folder(out, BY) as folder:
         meshes.write_layers(folder / SCENE, made)
         scene_page.write(folder / PAGE, scene, settings.capture.resolve().name)
         slicer_folder.write(folder / SLICER, scene, voxels, settings.scans)
-        counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made), "masses": len(scene.masses)}
-        metrics.write(folder / metrics.FILE, counts)
+        counts = {"layers": len(made), "scans_shown": sum(name.startswith("scan") for name in made)}
+        masses = np.nan if scene.masses is None else len(scene.masses)
+        metrics.write(folder / metrics.FILE, counts | {"masses": masses, "masses_search_failed": int(bool(search_failed))})
     watch.say(f"layers      {', '.join(made)}")
+    watch.say(f"search      {scene.search}")
     watch.say(f"wrote       {out}/{{{PAGE},{SCENE},{SLICER},{metrics.FILE}}}")
 
 
@@ -109,7 +114,7 @@ def read(settings: Settings) -> FusedScene:
         settings.rig.target,
         surface.skin,
         surface.rest,
-        {} if settings.masses is None else mass_files.read_masses(settings.masses),
+        None if settings.masses is None else mass_files.read_masses(settings.masses),
         {} if optics is None else optics.cameras,
     )
 

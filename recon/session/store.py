@@ -32,7 +32,7 @@ class Store:
     code: str  # digest of the code that does the steps
     record: dict[str, str] = field(default_factory=dict)  # name of a step -> digest of its inputs
     done: list[str] = field(default_factory=list)  # steps whose result is there
-    failed: list[str] = field(default_factory=list)  # steps that could not be done
+    failed: dict[str, str] = field(default_factory=dict)  # steps that could not be done, and why
 
     @contextmanager
     def opened(self, inputs: Iterable[Path | None]) -> Iterator[None]:
@@ -114,7 +114,7 @@ class Store:
 
     def fail(self, name: str, reason: str) -> None:
         """Say, in one line, that a step could not be done though its part is there."""
-        self.failed.append(name)
+        self.failed[name] = reason
         self.leave_out(name, reason)
 
     def digest(self, *names: str) -> dict[str, str]:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -113,6 +114,20 @@ def test_what_is_missing_is_named(rig, tmp_path, capsys):
     assert lines[0].startswith("left out    latency: no sweep over a flat bottom and no lag_s")
     for line, name in zip(lines[1:], ("volume", "masses", "scene"), strict=True):
         assert line.startswith(f"left out    {name}: no calibration of the probe")
+
+
+def test_masses_that_could_not_be_sought_are_not_said_to_be_none(rig, tmp_path, capsys):
+    """B-scans as dark as water."""
+    capture = sweep_sets.ball(tmp_path / "ball", rig, lag_s=0.05, count=3)
+    for path in (capture / "sweep").rglob("*.png"):
+        path.write_bytes(cv2.imencode(".png", np.full((100, 80), 2, np.uint8))[1].tobytes())
+    fields = [f"capture={capture}", "lag_s=0.05", "spacing_mm=3", f"out={tmp_path / 'out'}"]
+    assert main(["reconstruct", *fields]) == 1
+    found = metrics.read(tmp_path / "out" / "metrics.json")
+    assert np.isnan(found["scene_masses"]) and found["scene_masses_search_failed"] == 1
+    said = "The search for masses failed"
+    assert said in capsys.readouterr().out
+    assert said in (tmp_path / "out" / "scene" / "scene.html").read_text(encoding="utf-8")
 
 
 def test_frames_alone_become_poses(rig, tmp_path):

@@ -3,6 +3,7 @@
 import json
 import runpy
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import nrrd
@@ -97,6 +98,22 @@ def test_the_script_loads_every_file_and_puts_the_probe_under_its_transform(fold
     runpy.run_path(str(folder / "show.py"))
     assert set(loaded) == {path.name for path in folder.iterdir()} - {"show.py", "README.txt"}
     assert under == [("target_circles.ply", "transform"), ("target_probe.ply", "transform")]
+
+
+def test_a_search_that_failed_is_not_one_that_found_nothing(scene, tmp_path):
+    """Nor is either one that was not made: on the page, and for those who open the folder alone."""
+    outcomes = {"found": scene, "none": replace(scene, masses={}), "unsought": replace(scene, masses=None)}
+    outcomes["failed"] = replace(scene, masses=None, search_failed="too dark")
+    tiles, said = {}, {}
+    for name, one in outcomes.items():
+        slicer_folder.write(tmp_path / name, one, {}, scans=0)
+        said[name] = (tmp_path / name / "README.txt").read_text(encoding="utf-8").splitlines()[-1]
+        top = scene_page.opening(one, "")
+        tiles[name] = top.figures[-1]
+        assert name == "found" or said[name] in top.result
+    assert len(set(tiles.values())) == len(set(said.values())) == 4
+    assert (tiles["found"][1], tiles["none"][1]) == ("1", "0") and "0" not in tiles["failed"] + tiles["unsought"]
+    assert "too dark" in said["failed"]
 
 
 def test_the_page_has_the_view_its_slider_and_the_masses(scene, tmp_path):

@@ -67,7 +67,7 @@ def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, wor
     done(tmp_path, work)
     work.fault.append(InputError("capture: expected frames, found none"))
     steps = done(tmp_path, work, "2", say=lines.append)
-    assert steps.failed == ["part"] and steps.digest("part") == {} and steps.done == []
+    assert list(steps.failed) == ["part"] and steps.digest("part") == {} and steps.done == []
     assert lines[-1] == f"left out    part: capture: expected frames, found none; {tmp_path / 'part'} is of an earlier run"
     done(tmp_path, work, "1")
     assert work.calls == ["1", "2", "1"], "the result of before no longer counts"
@@ -81,7 +81,7 @@ def test_settings_that_do_not_fit_fail_one_step_in_one_line(tmp_path, work):
         assert steps.do("part", "a part", "verb", Settings, {"value": 3}, work.run, ("result.txt",), {}) is None
         assert steps.do("other", "another", "verb", Settings, {"value": "1"}, work.run, ("result.txt",), {}) is not None
     assert lines[0].startswith("left out    part: verb: value: expected") and "\n" not in lines[0]
-    assert (steps.failed, steps.done, work.calls) == (["part"], ["other"], ["1"])
+    assert (list(steps.failed), steps.done, work.calls) == (["part"], ["other"], ["1"])
 
 
 @pytest.mark.parametrize("before", [None, "1"])
