@@ -6,7 +6,6 @@ levels of its own, so that the brightness of the tissue beside is free. Profiles
 distance from the rough surface: unlike a blur of the image, this doesn't shrink what is round.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -35,14 +34,6 @@ RIDGE = 1e-9  # on the diagonal of the normal equations, for profiles without da
 OUTSIDE, INSIDE, LINE = 0, 1, 2  # rows of a trial: shares of both levels, and the bright line
 
 
-@dataclass(frozen=True)
-class Refined:
-    """A surface moved to the steps of its profiles."""
-
-    mesh: trimesh.Trimesh
-    moved: Array  # (n,) mm outwards, of the vertices
-
-
 class _Cells(NamedTuple):
     """Places sorted into cubes; a row of cubes along z lies in one piece."""
 
@@ -52,7 +43,7 @@ class _Cells(NamedTuple):
     start: NDArray[np.int64]  # (nx, ny, nz + 1) number of the first place in a cube; the last ends the row
 
 
-def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM) -> Refined:
+def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM) -> trimesh.Trimesh:
     """Move the vertices of a closed mesh along their normals to the border in the power."""
     number, distance, value, weight = _near(rough, power)
     bins = round(2 * REACH_MM / BIN_MM)
@@ -67,7 +58,7 @@ def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM)
     sure, pull = mix(vertices, normals, np.column_stack([1 / doubt, step / doubt]), patch_mm).T
     stay = 0.1  # of the median certainty: weight of the place before
     moved = pull / (sure + stay * np.median(sure))  # uncertain vertices stay
-    return Refined(evened(rough, vertices + moved[:, None] * normals), moved)
+    return evened(rough, vertices + moved[:, None] * normals)
 
 
 def mix(places: Array, normals: Array, values: Array, patch_mm: float) -> Array:
@@ -116,7 +107,7 @@ def _add_row(sums, cells, values, n, row, lengths):
 
 
 def evened(mesh: trimesh.Trimesh, vertices: Array) -> trimesh.Trimesh:
-    """A mesh with other vertices, spikes taken off by Taubin's smoothing, which keeps the volume."""
+    """A mesh with other vertices, spikes taken off by Taubin's smoothing, which nearly keeps the volume."""
     ends = mesh.faces[:, [0, 1, 2, 1, 2, 0]].T.reshape(2, -1)
     joined = sparse.csr_matrix((np.ones(ends.shape[1]), ends), shape=2 * (len(vertices),))
     joined = joined + joined.T
@@ -162,6 +153,8 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
 def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     """Places : (n,) mm at which profiles : (n, bins) step up, and a variance in some unit.
 
+    Where none is found, or the least misfit lies beside places at which nothing fits, as in noise alone, the variance is `NEVER`.
+
     Each trial place and blur is fitted with the levels within, without and of a line on the border; the least sum of squares,
     weighed as speckle scatters, counts. A weak line looks like a step elsewhere, so a line counts only where the fit is much
     better with it.
@@ -185,7 +178,7 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     before, here, after = costs[c - 1, rows], costs[c, rows], costs[c + 1, rows]
     bend = np.maximum(before + after - 2 * here, 1e-9)
     shift = np.clip((before - after) / (2 * bend), -0.5, 0.5)
-    found = (here < NEVER) & (costs.argmin(axis=0) == c)  # not at an end of the trials
+    found = (np.maximum(before, after) < NEVER) & (costs.argmin(axis=0) == c)  # not at an end
     return np.where(found, candidates[c] + shift * step_mm, 0.0), np.where(found, here / bend + 1e-3, NEVER)
 
 

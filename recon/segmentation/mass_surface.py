@@ -41,10 +41,10 @@ class Mass:
 
 
 def evened(mass: Mass, axes: Array) -> Mass:
-    """The same mass without folds and spikes finer than `EVEN_MM`, of the same volume.
+    """The same mass without folds and spikes finer than 0.5 mm, of the same volume.
 
     Moved vertices can cross each other; the smoothed distance to them has a clean surface, taken at the level of the same volume.
-    Its vertices are `MESH_MM` apart along the axes : (3, 3), columns.
+    Its vertices are 0.5 mm apart along the axes : (3, 3), columns.
     """
     even_mm = 0.5  # standard deviation; lobes of the blurred borders are wider
     mesh_mm = 0.5  # between vertices

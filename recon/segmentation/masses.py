@@ -175,7 +175,7 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 
     def refine(mass: Mass) -> Mass:
         for _ in range(times):
-            mass = evened(Mass(border_fit.refine(mass.mesh, power).mesh), power.volume.directions)
+            mass = evened(Mass(border_fit.refine(mass.mesh, power)), power.volume.directions)
         return mass
 
     return list(threads.mapped(refine, masses, most=len(masses)))
@@ -329,7 +329,7 @@ def _blurred(field: Map, sigma: Array) -> Map:
 
 
 def _opened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
-    """The voxels of a mask that lie in balls which fit into it, or no more than `BESIDE_MM` away."""
+    """The voxels of a mask that lie in balls which fit into it, or no more than half of the widest voxel away."""
     core = ~_widen(~mask, radius_mm, spacing)
     beside_mm = 0.25  # half of the widest voxel
     return mask & _widen(core, radius_mm + beside_mm, spacing)

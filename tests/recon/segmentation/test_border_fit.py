@@ -35,6 +35,17 @@ def test_misfits_are_those_of_least_squares(rng):
         assert lined[place, n] == pytest.approx(min(lines, default=border_fit.NEVER), rel=1e-6)
 
 
+@pytest.mark.parametrize(("line", "share"), [(0.0, 0.3), (0.5, 0.01)])
+def test_noise_alone_is_no_sure_border(line, share, rng):
+    """Flat profiles step up here and there by speckle, where variances are no less than a border's; a line is known better."""
+    s = border_fit.BIN_MM * (np.arange(24) + 0.5) - border_fit.REACH_MM
+    speckle, weight = rng.gamma(20, 1 / 20, (2, 500, 24)), np.full((500, 24), 100.0)
+    place, doubt = border_fit._steps(speckle[0] * (0.05 + 0.95 * ndtr(s / 0.3)), weight)
+    assert place.std() < 0.15
+    _, of_noise = border_fit._steps(speckle[1] * (0.08 + line * np.exp(-((s / 0.3) ** 2) / 2)), weight)
+    assert np.median(of_noise) == border_fit.NEVER and of_noise.min() > share * np.median(doubt)
+
+
 @pytest.mark.parametrize("patch_mm", [0.4, 5.0])
 def test_neighbours_count_by_distance_and_direction(patch_mm, rng):
     """Of a thin plate as well, whose sides face away from each other: in many cubes, or all in one."""
