@@ -259,9 +259,10 @@ def complete(new: Path, old: Path, by: str, shared: Collection[str] = ()) -> Non
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether a folder holds all files that its list names, of which there are some."""
+    """Whether a folder holds all files that its list names, of which there are some, as they were written."""
     files = _readable_list(folder)
-    return bool(files) and files.keys() <= entries(folder)
+    there = bool(files) and files.keys() <= entries(folder)
+    return there and all(_is_folder(folder / name) or is_unchanged(folder / name, files[name]) for name in files)
 
 
 def foreign(folder: Path) -> list[str]:

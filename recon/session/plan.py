@@ -33,7 +33,6 @@ from recon.session.store import Store, files_of
 from recon.session.tracker_settings import TrackingFields
 from recon.session.watch import SILENT, Watch
 from recon.tracking import networks
-from recon.tracking.results import POSES
 
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
 NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
@@ -192,8 +191,7 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
         optics_step.run(by_board, out, sources.command(by_board, out), sources.watch)
 
     does, fields = "cameras and projector, from the board", {"capture": settings.capture}
-    files = (optics_step.OPTICS, optics_step.PAGE)
-    made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, files, sources.files("board"))
+    made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, sources.files("board"))
     return None if made is None else made / optics_step.OPTICS
 
 
@@ -210,9 +208,9 @@ def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | 
         "camera": settings.camera,
         "implausible": settings.implausible,
     }
-    made_of, files = sources.files("surface") | _known_by(steps, "optics", optics), (skin_step.POINTS, skin_step.SKIN)
+    made_of = sources.files("surface") | _known_by(steps, "optics", optics)
     does, work = "the surface, from fringes", partial(skin_step.run, watch=sources.watch)
-    made = steps.do("surface", does, skin_step.BY, skin_step.Settings, fields, work, files, made_of)
+    made = steps.do("surface", does, skin_step.BY, skin_step.Settings, fields, work, made_of)
     return None if made is None else made / skin_step.SKIN
 
 
@@ -230,9 +228,8 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) 
     fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
     weights = settings.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
-    files = (POSES, MANIFEST) if SCANNER in part.images else (POSES,)
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
-    return steps.do(step, does, poses_step.BY, poses_step.Settings, fields, work, files, made_of)
+    return steps.do(step, does, poses_step.BY, poses_step.Settings, fields, work, made_of)
 
 
 def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> KnownLag | None:
@@ -251,7 +248,7 @@ def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path |
     fields = {"capture": tracked[name], "sweep": name, "implausible": settings.implausible}
     does, made_of = "the scanner's lag, from a flat bottom", _scans(steps, sources, name)
     work = partial(latency_step.run, watch=sources.watch)
-    made = steps.do("latency", does, latency_step.BY, latency_step.Settings, fields, work, (latency_step.LAG,), made_of)
+    made = steps.do("latency", does, latency_step.BY, latency_step.Settings, fields, work, made_of)
     return None if made is None else read_lag(made)
 
 
@@ -273,8 +270,8 @@ def calibrate_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path |
     fields = {field: getattr(settings, field) for field in ("rig", "implausible", "temperature_c", "scale_given")}
     fields |= {"capture": tracked[name], "sweep": name, "lag_s": lag.lag_s or 0.0}
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
-    files, work = (probe_step.PROBE, probe_step.FRAMES), partial(probe_step.run, usual=sources.usual, watch=sources.watch)
-    made = steps.do("probe", does, probe_step.BY, probe_step.Settings, fields, work, files, made_of)
+    work = partial(probe_step.run, usual=sources.usual, watch=sources.watch)
+    made = steps.do("probe", does, probe_step.BY, probe_step.Settings, fields, work, made_of)
     return None if made is None else made / probe_step.PROBE
 
 
@@ -308,8 +305,8 @@ def look_inside(
     placed |= {"lag_s": lag.lag_s, "lag_sigma_s": lag.sigma_s}
     does, fields = "B-scans in a volume", placed | {"spacing_mm": settings.spacing_mm}
     made_of = _scans(steps, sources, name) | _known_by(steps, "probe", probe)
-    files, work = (volume_step.VOLUME,), partial(volume_step.run, watch=sources.watch)
-    voxels = steps.do(volume, does, volume_step.BY, volume_step.Settings, fields, work, files, made_of)
+    work = partial(volume_step.run, watch=sources.watch)
+    voxels = steps.do(volume, does, volume_step.BY, volume_step.Settings, fields, work, made_of)
     if settings.find == "nothing":
         return None
     if skin is not None:
@@ -317,14 +314,14 @@ def look_inside(
     does, found = f"{'masses' if settings.find == 'masses' else 'a tube'} in the B-scans", _step_of(settings.find, name)
     fields = placed | {"surface": skin, "kind": settings.find, "spread_mm": settings.spread_mm, "slice_mm": settings.slice_mm}
     work = partial(masses_step.run, watch=sources.watch)
-    masses = steps.do(found, does, masses_step.BY, masses_step.Settings, fields, work, (), made_of)
+    masses = steps.do(found, does, masses_step.BY, masses_step.Settings, fields, work, made_of)
     if settings.find == "masses":
         fields = seen | show_together(settings, lag, skin, optics, masses, voxels)
         why = steps.failed.get(found, "")
-        made_of |= {"masses": [steps.digest(found), why], "optics": steps.digest("optics"), "volume": steps.digest(volume)}
+        made_of |= {"masses": [steps.digest(found), why], "volume": steps.digest(volume)}
+        made_of |= _known_by(steps, "optics", *filter(None, [optics]))
         does, work = "all of it in one picture", partial(scene_step.run, watch=sources.watch, search_failed=why)
-        shown, files = _step_of("scene", name), (scene_step.SCENE,)
-        steps.do(shown, does, scene_step.BY, scene_step.Settings, fields, work, files, made_of)
+        steps.do(_step_of("scene", name), does, scene_step.BY, scene_step.Settings, fields, work, made_of)
     return None
 
 

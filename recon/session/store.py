@@ -1,4 +1,4 @@
-"""Steps that are done once: each writes a folder, which is kept as long as nothing changes that it was made of.
+"""Steps that are done once: each writes a folder, which is kept as long as neither its files change nor what it was made of.
 
 A record in the folder of all steps holds a digest of each step's inputs: code, settings, files and earlier steps. A step is
 taken out of the record before it is done again and entered after its folder has appeared whole, so a run that was stopped
@@ -7,7 +7,7 @@ anywhere goes on where it was.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from recon.errors import InputError, validated
-from recon.files import atomic, json_text, metrics
+from recon.files import atomic, json_text, metrics, written_files
 
 RECORD = "reconstruct.json"
 BY = "reconstruct"  # who writes
@@ -68,7 +68,6 @@ class Store:
         model: type[Settings],
         fields: Mapping[str, Any],
         work: Callable[[Settings, Path], object],
-        files: Sequence[str],
         made_of: Mapping[str, object],
     ) -> Path | None:
         """Do a step, unless its result of before is there; returns its folder, None if it can't be done.
@@ -79,15 +78,14 @@ class Store:
         does : for people
         by : name of the verb that does the same
         model, fields : of the step's settings; fields that the model refuses fail this step alone
-        work : does the step by its settings, and writes its folder, whole or not at all
-        files : that the step hands on; all must be there for it to be kept
+        work : does the step by its settings, and writes its folder, whole or not at all, with the list of its files
         made_of : inputs beside the settings: digests of files and of earlier steps
         """
         place = self.folder / name
         try:
             settings = validated(model, fields, by)
             digest = digest_of([self.code, by, settings.model_dump(mode="json"), made_of])
-            if self.record.get(name) == digest and all((place / file).is_file() for file in (*files, metrics.FILE)):
+            if self.record.get(name) == digest and written_files.is_whole(place):
                 self.say(f"kept        {name}: {does}, as before")
                 self.done.append(name)
                 return place

@@ -1,5 +1,6 @@
 """`sonotwin reconstruct`: each part that a capture holds is used, what is missing is named, and nothing is done twice."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -9,10 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.capture import manifest, probe_files, sweep_part
+from recon.capture import calibration_files, manifest, probe_files, sweep_part
 from recon.capture.manifest import Manifest
 from recon.files import metrics, volumes
 from recon.files.written_files import LIST
+from recon.geometry.camera import Camera
+from recon.model.calibration import Calibration
 from recon.probe_calibration import tank_calibration
 from recon.session import latency_step, probe_step
 from sonotwin.cli import main
@@ -117,17 +120,24 @@ def test_what_is_missing_is_named(rig, tmp_path, capsys):
 
 
 def test_masses_that_could_not_be_sought_are_not_said_to_be_none(rig, tmp_path, capsys):
-    """B-scans as dark as water."""
+    """B-scans as dark as water. The scene is made again after another calibration, though its sweep has a track of its own."""
     capture = sweep_sets.ball(tmp_path / "ball", rig, lag_s=0.05, count=3)
     for path in (capture / "sweep").rglob("*.png"):
         path.write_bytes(cv2.imencode(".png", np.full((100, 80), 2, np.uint8))[1].tobytes())
-    fields = [f"capture={capture}", "lag_s=0.05", "spacing_mm=3", f"out={tmp_path / 'out'}"]
+    optics = tmp_path / "optics.yaml"
+    camera = Camera((64, 48), np.array([[80.0, 0, 32], [0, 80, 24], [0, 0, 1]]), np.zeros(5))
+    calibration_files.write(optics, Calibration({"cam1": camera}))
+    fields = [f"capture={capture}", "lag_s=0.05", "spacing_mm=3", f"out={tmp_path / 'out'}", f"calibration={optics}"]
     assert main(["reconstruct", *fields]) == 1
     found = metrics.read(tmp_path / "out" / "metrics.json")
     assert np.isnan(found["scene_masses"]) and found["scene_masses_search_failed"] == 1
     said = "The search for masses failed"
     assert said in capsys.readouterr().out
     assert said in (tmp_path / "out" / "scene" / "scene.html").read_text(encoding="utf-8")
+    os.utime(optics, ns=(1, 1))
+    assert main(["reconstruct", *fields]) == 1
+    again = capsys.readouterr().out
+    assert "kept        volume" in again and "kept        scene" not in again
 
 
 def test_frames_alone_become_poses(rig, tmp_path):

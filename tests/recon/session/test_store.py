@@ -9,6 +9,7 @@ import pytest
 from pydantic import BaseModel
 
 from recon.errors import InputError
+from recon.files import atomic
 from recon.session.store import RECORD, Store, files_of
 
 
@@ -25,9 +26,9 @@ def work():
 
     def run(settings, out):
         calls.append(settings.value)
-        out.mkdir(parents=True, exist_ok=True)
-        for name in ("result.txt", "metrics.json"):
-            (out / name).write_text(settings.value)
+        with atomic.new_folder(out, "verb") as folder:
+            for name in ("result.txt", "extra.txt", "metrics.json"):
+                (folder / name).write_text(settings.value)
         if fault:
             raise fault.pop()
 
@@ -39,7 +40,7 @@ def done(folder: Path, work, value: str = "1", source: Path | None = None, say=l
     steps = Store(folder, say, code)
     with steps.opened([]):
         made_of = {"files": files_of([source] if source else [])}
-        steps.do("part", "a part", "verb", Settings, {"value": value}, work.run, ("result.txt",), made_of)
+        steps.do("part", "a part", "verb", Settings, {"value": value}, work.run, made_of)
     return steps
 
 
@@ -56,10 +57,21 @@ def test_a_step_is_done_again_for_another_setting_a_changed_file_or_a_lost_one(t
     done(out, work, "2", source)
     os.utime(source, ns=(1, 1))
     done(out, work, "2", source)
-    for name in ("result.txt", "metrics.json"):
+    for name in ("result.txt", "extra.txt", "metrics.json"):
         (out / "part" / name).unlink()
         done(out, work, "2", source)
-    assert work.calls == ["1", "2", "2", "2", "2"]
+    assert work.calls == ["1", "2", "2", "2", "2", "2"]
+
+
+def test_a_result_that_was_changed_is_not_kept_nor_lost(tmp_path, work):
+    """Its change is another's work, which is named, and stays where it is until it is moved away."""
+    lines, changed = [], tmp_path / "part" / "extra.txt"
+    done(tmp_path, work)
+    changed.write_text("2")
+    assert done(tmp_path, work, say=lines.append).done == []
+    assert "extra.txt: expected nothing or a file as verb wrote it, found it changed since" in lines[-1]
+    changed.rename(tmp_path.with_suffix(".txt"))
+    assert done(tmp_path, work).done == ["part"]
 
 
 def test_a_step_that_fails_is_left_out_in_one_line_and_tried_again(tmp_path, work):
@@ -78,8 +90,8 @@ def test_settings_that_do_not_fit_fail_one_step_in_one_line(tmp_path, work):
     lines = []
     steps = Store(tmp_path, lines.append, "a")
     with steps.opened([]):
-        assert steps.do("part", "a part", "verb", Settings, {"value": 3}, work.run, ("result.txt",), {}) is None
-        assert steps.do("other", "another", "verb", Settings, {"value": "1"}, work.run, ("result.txt",), {}) is not None
+        assert steps.do("part", "a part", "verb", Settings, {"value": 3}, work.run, {}) is None
+        assert steps.do("other", "another", "verb", Settings, {"value": "1"}, work.run, {}) is not None
     assert lines[0].startswith("left out    part: verb: value: expected") and "\n" not in lines[0]
     assert (list(steps.failed), steps.done, work.calls) == (["part"], ["other"], ["1"])
 
