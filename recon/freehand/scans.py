@@ -45,7 +45,6 @@ Array = NDArray[np.float64]
 Extent = Literal["aligned", "principal"]
 
 MOST_KEPT = 512 << 20  # bytes of images that are kept in memory
-STEP_S = 0.005  # of the poses' rates
 
 
 class Unsure(NamedTuple):
@@ -226,21 +225,13 @@ def of_sweep(
         np.zeros((found.sum(), 6, 6)) if covariance is None else covariance[found],
         sweep.pose_shares(lag_s),
         np.zeros((len(sweep.paths), 6, 6)) if shared is None else shared,
-        _rates(sweep, lag_s) @ target_from_pixel,
+        tracks.rates_at(sweep.track, sweep.times, lag_s) @ target_from_pixel,
         unsure.lag_s,
         unsure.tissue_m_s / converted.speed_m_s,
         covariance is not None,
     )
     placed = sweep.poses(lag_s) @ target_from_pixel
     return Scans(sweep.size[::-1], placed, sweep.images, converted.speed_m_s, probe.speed_m_s, converted, errors)
-
-
-def _rates(sweep: SweepCapture, lag_s: float) -> Array:
-    """Change of the poses : (n, 4, 4) per s, zero where there is none."""
-    before, at, after = (tracks.poses_at(sweep.track, sweep.times, lag_s + step) for step in (STEP_S, 0.0, -STEP_S))
-    rates = np.where(np.isfinite(before), at - before, after - at) / STEP_S
-    both = np.isfinite(before) & np.isfinite(after)
-    return np.nan_to_num(np.where(both, (after - before) / (2 * STEP_S), rates))
 
 
 def of_sequence(

@@ -94,3 +94,12 @@ def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
     lag_s : how late the time stamps are; see `recon.probe_calibration.latency.Lag`.
     """
     return at(track, np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9)))
+
+
+def rates_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
+    """Change of these poses : (n, 4, 4) per s, by which a longer lag moves them back; zero where there is none."""
+    step_s = 0.005
+    before, there, after = (poses_at(track, times, lag_s + step) for step in (step_s, 0.0, -step_s))
+    rates = np.where(np.isfinite(before), there - before, after - there) / step_s
+    both = np.isfinite(before) & np.isfinite(after)
+    return np.nan_to_num(np.where(both, (after - before) / (2 * step_s), rates))

@@ -50,9 +50,11 @@ def look(
     appearance: Appearance | None = None,
     corner: tuple[int, int] = (0, 0),
     phantom: str = point_calibration.CROSSED_WIRES,
+    pose_by_lag: Array | None = None,
 ) -> CrossingFrames:
     """Find the crossing in n B-scans, taken one by one, at poses : (n, 4, 4) with a covariance : (n, 6, 6).
 
+    pose_by_lag : (n, 4, 4) change of the poses by one standard deviation of the B-scans' lag.
     size, corner : of the whole images, and the column and row of the first pixel of the parts that are looked at; px.
     phantom : module of `recon.probe_calibration.phantoms` that finds it.
     """
@@ -60,9 +62,9 @@ def look(
     sightings = replace(sightings, pixels=sightings.pixels + corner)
     whole = tuple(replace(crossing, pixel=crossing.pixel + corner) for crossing in crossings)
     frames = CrossingFrames(name, size, sightings, numbers, whole, corner[1])
-    if pose_covariance is None:
-        return frames
-    return replace(frames, sightings=replace(sightings, pose_covariance=pose_covariance[frames.usable]))
+    of_poses = {"pose_covariance": pose_covariance, "pose_by_lag": pose_by_lag}
+    usable = {field: None if value is None else value[frames.usable] for field, value in of_poses.items()}
+    return replace(frames, sightings=replace(sightings, **usable))
 
 
 def of_pairs(name: str, size: Size, poses: Array, pixels: Array) -> CrossingFrames:

@@ -83,6 +83,7 @@ class Sightings:
     pixel_covariance: Array | None = None  # (n, 2, 2) px^2
     slice_mm: Array | None = None  # (n,) standard deviation across the image plane
     directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN for a spot
+    pose_by_lag: Array | None = None  # (n, 4, 4) change of the poses by one standard deviation of the B-scans' lag
     beside: Array | None = None  # (n, 2) px a mm: shift of the lines' meeting point by the wires' distance; set by `calibrate`
 
     def of(self, chosen: ArrayLike) -> "Sightings":
@@ -129,10 +130,13 @@ class _Estimate:
         """Pixels : (n, 2) of the midpoint between the wires."""
         return sightings.pixels if sightings.beside is None else sightings.pixels - self.apart * sightings.beside
 
+    def points(self, sightings: Sightings) -> Array:
+        """Places : (n, 3) mm of these pixels in the target's frame."""
+        return (self.pixels(sightings) * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
+
     def arms(self, sightings: Sightings) -> Array:
         """Vectors : (n, 3) mm, along the world's axes, from the target's origin to the places of these pixels."""
-        points = (self.pixels(sightings) * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
-        return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], points)
+        return np.einsum("nij,nj->ni", sightings.poses[:, :3, :3], self.points(sightings))
 
 
 def calibrate(
@@ -198,11 +202,15 @@ def calibrate(
     estimate = estimate.moved(Step(np.pad(step, (0, len(UNKNOWNS) - used)), np.zeros((0, 0))))
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     covariance = covariance[: len(NAMES), : len(NAMES)].copy()
+    if sightings.pose_by_lag is not None:
+        by_lag = _by_lag(estimate, sightings, noise, inliers)
+        covariance += np.outer(by_lag, by_lag)
     try:
         place = estimate.target_from_image, estimate.scale
         probe_checks.certainty(*place, covariance, sightings.of(inliers), size, max_sigma_mm)
     except InputError as error:
-        raise InputError(str(error) if moved is None else f"{error}; {moved.described}") from None
+        late = "" if sightings.pose_by_lag is None else "; the uncertainty of the lag is in it: hold still, or measure the lag"
+        raise InputError(f"{error}{late}" if moved is None else f"{error}; {moved.described}") from None
     covariance[SHIFT, SHIFT] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
@@ -304,12 +312,13 @@ def motion(size: Size, count: int = 30, tilt_deg: float = 35.0, roll_deg: float 
 
 def _checked(sightings: Sightings, size: Size) -> Sightings:
     """As float arrays, or refused."""
-    poses, pixels = probe_checks.arrays(sightings)
+    given = probe_checks.arrays(sightings)
+    poses, pixels = given["poses"], given["pixels"]
     if len(poses) < MIN_FRAMES:
         raise InputError(f"sightings: expected at least {MIN_FRAMES} frames with a pose and a crossing, found {len(poses)}")
     probe_checks.poses(poses)
     probe_checks.pixels(pixels, size)
-    return replace(sightings, poses=poses, pixels=pixels, beside=None)
+    return Sightings(**given)
 
 
 def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sightings:
@@ -431,6 +440,18 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
         gate = 3 * stats.f.isf(stats.chi2.sf(GATE, 3), 3, freedom)  # GATE of a level that is itself measured by these frames
     return estimate, inliers, float(factor)
+
+
+def _by_lag(estimate: _Estimate, sightings: Sightings, noise: Noise, used: Mask) -> Array:
+    """Change of the calibration : (8,) by one standard deviation of the lag, which moves all poses along their motions."""
+    assert sightings.pose_by_lag is not None
+    moved = sightings.pose_by_lag[used]
+    there = sightings.of(used)
+    shifts = np.einsum("nij,nj->ni", moved[:, :3, :3], estimate.points(there)) + moved[:, :3, 3]
+    slopes = _whitened(estimate, there, noise)[0]
+    left = whitening(_covariances(estimate, there, noise)) @ shifts[..., None]
+    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(KNOWN)
+    return -np.linalg.solve(information, np.einsum("nij,nik->j", slopes, left))[: len(NAMES)]
 
 
 def _squared_as_predicted(estimate: _Estimate, sightings: Sightings, noise: Noise, used: Mask) -> Array:

@@ -43,16 +43,30 @@ class _Sightings(_Frames, Protocol):
     def pixel_covariance(self) -> Array | None: ...
     @property
     def slice_mm(self) -> Array | None: ...
+    @property
+    def directions(self) -> Array | None: ...
+    @property
+    def pose_by_lag(self) -> Array | None: ...
 
 
-def arrays(sightings: _Sightings) -> tuple[Array, Array]:
-    """Poses and pixels as float arrays; refuses all that are no numbers of n frames."""
+def arrays(sightings: _Sightings) -> dict[str, Array]:
+    """The fields that are given, as float arrays; refuses all that are no numbers of n frames, and covariances that are none."""
     count = len(arguments.numbers("sightings: poses", sightings.poses, ("n", 4, 4), finite=False))
-    fields = {"poses": (4, 4), "pixels": (2,)}
-    for name, shape in (fields | {"pose_covariance": (6, 6), "pixel_covariance": (2, 2), "slice_mm": ()}).items():
-        if name in fields or getattr(sightings, name) is not None:
-            arguments.numbers(f"sightings: {name}", getattr(sightings, name), (count, *shape), finite=name not in fields)
-    return np.asarray(sightings.poses, float), np.asarray(sightings.pixels, float)
+    needed, unseen = {"poses": (4, 4), "pixels": (2,)}, {"directions": (2, 2)}  # poses and pixels have checks of their own
+    covariances, others = {"pose_covariance": (6, 6), "pixel_covariance": (2, 2)}, {"slice_mm": (), "pose_by_lag": (4, 4)}
+    found = {}
+    for name, shape in (needed | unseen | covariances | others).items():
+        value = getattr(sightings, name)
+        if name in needed or value is not None:
+            finite = name not in needed and name not in unseen
+            found[name] = np.asarray(arguments.numbers(f"sightings: {name}", value, (count, *shape), finite), float)
+    for name in covariances.keys() & found.keys():
+        sigmas = np.sqrt(np.maximum(np.diagonal(found[name], axis1=1, axis2=2), np.finfo(float).tiny))
+        least = np.linalg.eigvalsh(found[name] / (sigmas[:, :, None] * sigmas[:, None])).min(axis=1)
+        if (least < -1e-6).any():
+            k = int(least.argmin())
+            raise InputError(f"sightings: {name}: frame {k}: expected a covariance, found a negative variance")
+    return found
 
 
 def poses(world_from_target: Array) -> None:

@@ -268,7 +268,7 @@ def calibrate_probe(steps: Store, sources: Sources, tracked: Mapping[str, Path |
     if tracked[name] is None or lag is None:
         return steps.fail("probe", NO_LAG if lag is None else f"no poses of the sweep {name}; give probe=...")
     fields = {field: getattr(settings, field) for field in ("rig", "implausible", "temperature_c", "scale_given")}
-    fields |= {"capture": tracked[name], "sweep": name, "lag_s": lag.lag_s or 0.0}
+    fields |= {"capture": tracked[name], "sweep": name, "lag_s": lag.lag_s, "lag_sigma_s": lag.sigma_s}
     does, made_of = "the ultrasound probe, from crossed wires", _scans(steps, sources, name)
     work = partial(probe_step.run, usual=sources.usual, watch=sources.watch)
     made = steps.do("probe", does, probe_step.BY, probe_step.Settings, fields, work, made_of)

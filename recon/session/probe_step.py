@@ -13,9 +13,11 @@ from recon.capture.sweep_part import SweepCapture
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import sequence_sweep
+from recon.freehand.scans import ASSUMED
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
 from recon.freehand.volume_compounding import Clip, Rectangle
-from recon.model.rig import Probe, Rig
+from recon.model import tracks
+from recon.model.rig import NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
 from recon.probe_calibration.crossing_frames import CrossingFrames
@@ -46,18 +48,26 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
     clip: Rectangle | None = None
     """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is all of it. The
     calibration holds for the whole images all the same"""
-    lag_s: LagSeconds = 0.0
-    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
+    lag_s: LagSeconds | None = None
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`; null takes none, of a capture to 0.1 s"""
+    lag_sigma_s: NotNegative | None = None
+    """s, standard deviation of the former, 0 where that is given; it counts where the probe moved as B-scans were taken"""
 
     @model_validator(mode="after")
     def _one_source(self) -> "Settings":
         given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
         if len(given) != 1:
             raise ValueError(f"expected one of capture, sequence and pairs, found {' and '.join(given) or 'none'}")
-        for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None)):
+        for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None), ("lag_sigma_s", self.lag_sigma_s or None)):
             if self.pairs is not None and value is not None:
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
         return self
+
+    @property
+    def lag_sigma(self) -> float:
+        """Standard deviation of the lag, s, wider of one that isn't given but assumed."""
+        assumed = self.capture is not None and self.lag_s is None
+        return ASSUMED.lag_s if self.lag_sigma_s is None and assumed else self.lag_sigma_s or 0.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +101,10 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         frames = crossing_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
         sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "probe")
-        frames = look(sweep, settings, settings.lag_s, settings.clip, watch)
+        if settings.lag_s is None and settings.lag_sigma:
+            sigma = f"± {1e3 * settings.lag_sigma:g} ms (1 sigma), of which rest alone is free"
+            watch.say(f"assumed     no lag of the B-scans, {sigma}; measure-lag finds it, give lag_s")
+        frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
     for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
         watch.say(line)
@@ -110,6 +123,7 @@ def look(
     lag_s: float = 0.0,
     clip: Rectangle | None = None,
     watch: Watch = SILENT,
+    lag_sigma_s: float = 0.0,
 ) -> CrossingFrames:
     """Find the crossing in the B-scans of a sweep, read one by one.
 
@@ -117,6 +131,7 @@ def look(
     ----------
     lag_s : s, of the B-scans behind the poses
     clip : part of each B-scan that is looked at; None for all of it
+    lag_sigma_s : s, standard deviation of the lag
     """
     chosen, part = settings or tank_calibration.Settings(), Clip(*clip) if clip else Clip(0, 0, *sweep.size)
     images: Iterable = watch.follow(sweep.images(), len(sweep.frames), "looking for the crossing")
@@ -130,6 +145,7 @@ def look(
         chosen.appearance,
         part.corner,
         chosen.phantom,
+        lag_sigma_s * tracks.rates_at(sweep.track, sweep.times, lag_s) if lag_sigma_s else None,
     )
 
 

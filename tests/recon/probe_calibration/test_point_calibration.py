@@ -1,6 +1,7 @@
 """A probe's calibration is repeatable, right, as sure as it says, and refuses what leaves it open."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -84,6 +85,35 @@ def test_the_covariance_is_honest(probe, frames, rng):
         total += error @ np.linalg.solve(made.uncertainty.covariance, error)
     low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 15)
     assert low < total < high * 79 / 77  # the noise level itself is measured, from 79 degrees of freedom
+
+
+def test_a_lag_that_is_off_by_its_sigma_moves_the_probe_as_far_as_its_covariance_says(probe, frames, rng):
+    """Frames of a probe in motion: all poses are late together, by 0.3 mm and 0.1 degrees here, to any side."""
+    seen = observe(probe, *frames, rng)
+    late = rigid.moved(seen.poses, rng.standard_normal((len(seen.poses), 6)) * [*3 * [np.radians(0.1)], *3 * [0.3]])
+    still, known = (calibrate(replace(seen, poses=poses), SIZE, NOISE).calibration for poses in (late, seen.poses))
+    unsure = calibrate(replace(seen, pose_by_lag=late - seen.poses), SIZE, NOISE).calibration
+    assert np.array_equal(unsure.to_target(POINTS), known.to_target(POINTS))
+    by_lag = point_calibration.point_covariance(unsure, POINTS) - point_calibration.point_covariance(known, POINTS)
+    shifts = np.linalg.norm(still.to_target(POINTS) - known.to_target(POINTS), axis=1)
+    assert shifts.max() > 0.05 and np.sqrt(np.trace(by_lag, axis1=1, axis2=2)) == pytest.approx(shifts, rel=0.1, abs=0.03)
+
+
+@pytest.mark.parametrize(("field", "value", "complaint"), [
+    ("pixel_covariance", [[[1.0, 2.0], [2.0, 1.0]]] * 30, "pixel_covariance: frame 0: expected a covariance, found a negative"),
+    ("pose_covariance", -np.tile(np.eye(6), (30, 1, 1)), "pose_covariance: frame 0: expected a covariance, found a negative"),
+    ("directions", np.zeros((30, 2)), r"directions: expected numbers of shape \(30, 2, 2\)"),
+])  # fmt: skip
+def test_what_is_no_covariance_or_of_another_shape_is_refused(probe, frames, rng, field, value, complaint):
+    with pytest.raises(InputError, match=complaint):
+        calibrate(replace(observe(probe, *frames, rng), **{field: value}), SIZE, NOISE)
+
+
+def test_covariances_may_be_lists(probe, frames, rng):
+    seen = observe(probe, *frames, rng)
+    given = np.tile(PIXEL_PX**2 * np.eye(2), (30, 1, 1))
+    by_lists, by_arrays = (calibrate(replace(seen, pixel_covariance=one), SIZE, NOISE) for one in (given.tolist(), given))
+    assert np.array_equal(by_lists.residuals, by_arrays.residuals)
 
 
 def test_the_level_of_the_noise_is_measured(probe, frames, rng):
