@@ -84,12 +84,12 @@ def whole(name: str, value: Any, least: int, most: int) -> int:
     return int(value)
 
 
-def image_size(name: str, value: Any) -> tuple[int, int]:
-    """Width and height of images."""
+def image_size(name: str, value: Any, order: str = "width and height") -> tuple[int, int]:
+    """Width and height of images, or height and width, as of the order that messages name."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
-        raise InputError(f"{name}: expected width and height in px, found {described(value)}")
-    width, height = (whole(name, side, 1, 100_000) for side in value)
-    return width, height
+        raise InputError(f"{name}: expected {order} in px, found {described(value)}")
+    first, second = (whole(name, side, 1, 100_000) for side in value)
+    return first, second
 
 
 def places_of_pixels(name: str, value: Any) -> NDArray[np.float64]:

@@ -91,16 +91,21 @@ def from_scans(
     Raises
     ------
     InputError
-        If no image has a pose, or they show no tissue.
+        If no image has a pose, they show no tissue, or `shape` isn't theirs.
     """
     if not callable(images):
         expected = "a function that gives the B-scans from the first on, such as lambda: iter(scans)"
         raise InputError(f"images: expected {expected}, found {arguments.described(images)}")
     arguments.of_kind("sound", sound, Sound, type(None))
     arguments.of_kind("blur", blur, Blur, type(None))
-    shape = arguments.image_size("shape", shape)
+    height, width = arguments.image_size("shape", shape, "height and width")
+    shape = height, width
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     sound = sound or Sound()
+    first = next(images(), None)
+    if first is not None and np.shape(first) != shape:
+        found = f"images of shape {np.shape(first)}"
+        raise InputError(f"shape: expected that of the images, height and width, found {shape} with {found}: swapped?")
     clip = _below_face(shape, world_from_pixel)
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
@@ -195,6 +200,11 @@ def rough(power: EchoPower) -> list[Mass]:
     for _ in range(3):
         level = _smooth(tissue, power.weight * bright, LIMITS.around_mm / spacing)
         bright = seen & (smooth > LIMITS.dark * np.nan_to_num(level, nan=np.inf))
+    middles = _middles(seen & ~bright, spacing)
+    if middles.any() and (bright & ~middles).any():
+        hollow = middles & (smooth < LIMITS.dark * level[_nearest(bright & ~middles, spacing)])
+        level = _smooth(tissue, power.weight * (bright & ~hollow), LIMITS.around_mm / spacing)
+        level = np.where(hollow, level[_nearest(np.isfinite(level), spacing)], level)
     ratio = np.where(seen, smooth / level, 1.0)
     dark = seen & (ratio < LIMITS.dark)
     dark &= ~_risen(np.where(dark, ratio, np.inf))
@@ -230,6 +240,23 @@ def rough(power: EchoPower) -> list[Mass]:
             field = np.where(_widen(inside, LIMITS.grow_mm, spacing), ratio[part], 1.0)
             result.append(Mass(meshed(field, (1 + core) / 2, part, power.volume)))
     return result
+
+
+def _middles(dark: Mask, spacing: Array) -> Mask:
+    """Voxels with dark ones all around; none unless they are many, as in a body so large that its middle surrounds itself."""
+    labels, count = ndimage.label(~dark)
+    open_ = np.zeros(count + 1, bool)
+    open_[0] = True
+    for axis in range(3):
+        open_[labels.take([0, -1], axis)] = True
+    inner = ~open_[labels]
+    sizes = np.bincount(labels[inner], minlength=1) * float(np.prod(spacing))
+    return inner if sizes.max() >= LIMITS.least_mm3 else np.zeros_like(inner)
+
+
+def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
+    """Indices of the voxel of a mask that is nearest to each."""
+    return tuple(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True))
 
 
 def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Mask:

@@ -54,6 +54,16 @@ def test_a_ball_is_as_large_as_it_is(rng):
     assert np.linalg.norm(mass.centre - CENTRE) < 0.12
 
 
+def test_a_body_larger_than_its_surroundings_count_is_no_hollow_one(rng):
+    """48 mm wide: from its middle no tissue is within reach."""
+    step, radius = 1.5, 24.0
+    distance = step * np.linalg.norm(np.mgrid[-22:23, -22:23, -22:23], axis=0)
+    mean = np.where(distance < radius, DARK, 1.0)
+    voxels = (mean * rng.gamma(40, 1 / 40, mean.shape)).astype(np.float32)
+    (mass,) = rough(EchoPower(Volume(voxels, np.zeros(3), np.full(3, step)), np.full(mean.shape, 40, np.float32)))
+    assert mass.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05) and mass.mesh.body_count == 1
+
+
 def test_a_bright_wall_does_not_change_it(rng):
     """The front reflects, 6 times as bright as tissue at most. At half level the border would lie 0.4 mm inside of it there."""
     mean, distance = ball()
@@ -174,6 +184,15 @@ def test_the_level_of_tissue_is_that_of_images_with_a_pose():
         masses.tissue_grey(iter(np.full((5, 200, 40), 4, np.uint8)), (200, 40), matrices)
     with pytest.raises(InputError, match="images: expected more than 6 mm of depth, found 20 rows, of which 15 are ringing"):
         masses.tissue_grey(iter(images[:, :20]), (20, 40), matrices)
+
+
+def test_a_shape_that_is_not_the_images_is_refused():
+    """Height comes first; taken for width and height, a transposed part of the scan would be searched."""
+    matrices = np.tile(np.diag([0.2, 0.2, 0.2, 1.0]), (3, 1, 1))
+    with pytest.raises(InputError, match=r"shape: expected that of the images, height and width, .* \(40, 200\).*200, 40"):
+        masses.from_scans(lambda: iter(np.full((3, 200, 40), 100, np.uint8)), (40, 200), matrices)
+    with pytest.raises(InputError, match="shape: expected height and width in px"):
+        masses.from_scans(lambda: iter(()), 200, matrices)
 
 
 @pytest.mark.parametrize("shape", [(9, 30, 21), (1, 12, 40), (40, 5, 3)])
