@@ -4,7 +4,7 @@ Frames pass one by one; in memory are the volume and one image. `world_from_pixe
 [u, v, 0, 1] to mm, the poses times the probe's calibration (`recon.freehand.sequences.target_from_pixel`).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import repeat
 from typing import Annotated, Literal, NamedTuple, get_args
@@ -133,7 +133,7 @@ def aligned_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
 
     It ends with the voxel of the greatest coordinates, as the volumes of the PLUS toolkit do.
     """
-    return _grid(around, spacing_mm, np.eye(3))
+    return _grid(_points(around), spacing_mm, np.eye(3))
 
 
 def principal_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
@@ -141,8 +141,9 @@ def principal_grid(around: Array, spacing_mm: ArrayLike) -> Grid:
 
     It is much smaller than the other where the sweep runs across the world's axes.
     """
-    around = np.asarray(arguments.numbers("around", around, ("n", 3)), float)
-    _, _, rows = np.linalg.svd(around - around.mean(axis=0), full_matrices=False)
+    around = _points(around)
+    apart = around - around.mean(axis=0)
+    _, _, rows = np.linalg.svd(np.pad(apart, ((0, max(0, 3 - len(apart))), (0, 0))), full_matrices=False)
     rows *= np.sign(rows[np.arange(3), np.abs(rows).argmax(axis=1)])[:, None]  # along the world's axes, not against
     rows[2] *= np.sign(np.linalg.det(rows))
     return _grid(around, spacing_mm, rows.T)
@@ -211,10 +212,15 @@ def reconstruct(
     voxels, weight = np.zeros(shape, np.uint8), np.zeros(shape if as_plus else (0, 0, 0), np.uint16)
     voxel_from_world = np.linalg.inv(Volume(voxels, grid.origin, grid.spacing, grid.directions).world_from_voxel)
     count = 0
-    for image, mask in zip(images, masks if masks is not None else repeat(None), strict=False):
+    left: Iterator[Mask | None] = repeat(None) if masks is None else iter(masks)
+    for image in images:
         arguments.of_kind(f"image {count}", image, np.ndarray)
         if count == len(world_from_pixel):
             raise InputError(f"images: expected as many as poses, {count}, found more")
+        try:
+            mask = next(left)
+        except StopIteration:
+            raise InputError(f"masks: expected one for each image, found {count}") from None
         matrix = voxel_from_world @ world_from_pixel[count]
         count += 1
         if np.isfinite(matrix).all():
@@ -236,10 +242,20 @@ def reconstruct(
                 plus_arithmetic.paste(plain, matrix, levels, rule, linear, fixed)
     if count < len(world_from_pixel):
         raise InputError(f"images: expected as many as poses, {len(world_from_pixel)}, found {count}")
+    if masks is not None and next(left, left) is not left:
+        raise InputError(f"masks: expected one for each image, {count}, found more")
     if sums is not None:
         _finish(sums, compounding in ("mean", "weighted"), voxels)
     filled = (weight if sums is None else sums.weight) > 0
     return Reconstruction(Volume(voxels, grid.origin, grid.spacing, grid.directions), filled)
+
+
+def _points(around: Array) -> Array:
+    """Points : (n, 3) that a grid is to hold, n >= 1, as floats."""
+    points = np.asarray(arguments.numbers("around", around, ("n", 3)), float)
+    if not len(points):
+        raise InputError("around: expected points, mm, found none")
+    return points
 
 
 def _grid(around: Array, spacing_mm: ArrayLike, directions: Array) -> Grid:

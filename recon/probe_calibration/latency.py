@@ -91,7 +91,7 @@ def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tu
     seconds = (times - origin) * 1e-9
     moments = (track.times[track.found] - origin) * 1e-9
     start = _search(seconds[seen], depths[seen], moments, coordinates[:, 0], search_s)
-    return _refined(seconds, depths, moments, _smooth(moments, coordinates), start)
+    return _refined(seconds, depths, moments, _smooth(moments, coordinates), start, search_s)
 
 
 def measure(depths: Array, found: Lag) -> Metrics:
@@ -229,7 +229,7 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
     return float(lags[best])
 
 
-def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float) -> Lag:
+def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float, search_s: tuple[float, float]) -> Lag:
     """Weighted least squares over a, b and the lag, with variances of depth and of time estimated from the residuals."""
     lag, speed = start, spline.derivative()
     seen = np.isfinite(depths)
@@ -260,6 +260,11 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
             break
     _agree(predicted, depths, inside, used)
     sigma = _sigma(design[used], residuals[used], 1 / variance[used])
+    if abs(step[-1]) > sigma:
+        found = f"it still moving by {1e3 * abs(step[-1]):.1f} ms a round, {lag:.3f} s at last"
+        raise InputError(f"depths: expected the lag to settle near {start:.2f} s, found {found}")
+    if not search_s[0] <= lag <= search_s[1]:
+        raise InputError(f"search_s: expected the lag within {search_s[0]:g} to {search_s[1]:g} s, found {lag:.3f} s")
     reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - design.shape[1])) * sigma
     return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals)
 

@@ -256,11 +256,23 @@ def test_what_cannot_be_reconstructed(sweep):
         volume_compounding.reconstruct(images[1:], matrices, grid)
     with pytest.raises(InputError, match="images: expected as many as poses, 11, found more"):
         volume_compounding.reconstruct(images, matrices[1:], grid)
+    pairs = [(images, matrices[1:], 12, "images: expected as many as poses, 11, found more")]
+    pairs += [(images, matrices, 11, "masks: expected one for each image, found 11")]
+    pairs += [(images, matrices, 13, "masks: expected one for each image, 12, found more")]
+    for some, placed, masks, complaint in pairs:
+        with pytest.raises(InputError, match=complaint):
+            volume_compounding.reconstruct(some, placed, grid, masks=[np.ones(SHAPE, bool)] * masks)
     with pytest.raises(
         InputError, match=r"image 0: expected height x width of uint8 and a mask like it, found .*, mask \(3, 3\)"
     ):
         volume_compounding.reconstruct(images, matrices, grid, masks=[np.ones((3, 3), bool)] * 12)
     with pytest.raises(InputError, match="poses: expected at least one that is valid, found none in 12"):
         volume_compounding.corners(np.full((12, 4, 4), np.nan), SHAPE)
+    for make in (volume_compounding.aligned_grid, volume_compounding.principal_grid):
+        with pytest.raises(InputError, match="around: expected points, mm, found none"):
+            make(np.zeros((0, 3)), 0.5)
+        with pytest.raises(InputError, match=r"around: expected numbers of shape \(n, 3\)"):
+            make(np.zeros((4, 2)), 0.5)
+        assert np.prod(make(np.array([[1.0, 2, 3], [1, 2, 5]]), 0.5).size) == 5
     with pytest.raises(InputError, match="spacing_mm: expected lengths above 0 mm, one or three, found -1"):
         volume_compounding.aligned_grid(around, -1)

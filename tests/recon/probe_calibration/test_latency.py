@@ -132,6 +132,18 @@ def test_a_lag_outside_the_search_is_refused():
     refused("lag within -0.1 to 0.1 s", height, lambda t: height(t - 0.15), (-0.1, 0.1))
 
 
+def test_a_lag_that_does_not_settle_or_leaves_the_search_is_refused(rng):
+    """Begun 1 s off, the fit goes 50 ms a round; begun within a search that ends before the lag, it goes to the lag."""
+    times, depths, track = streams(0.1, rng)
+    coordinates, seconds = latency._coordinates(track), (times - track.times[0]) * 1e-9
+    moments = (track.times[track.found] - track.times[0]) * 1e-9
+    spline = latency._smooth(moments, coordinates)
+    with pytest.raises(InputError, match="depths: expected "):
+        latency._refined(seconds, depths, moments, spline, 1.1, (-2, 2))
+    with pytest.raises(InputError, match=r"search_s: expected the lag within -0.5 to 0.09 s, found 0.\d+ s"):
+        latency._refined(seconds, depths, moments, spline, 0.08, (-0.5, 0.09))
+
+
 def test_too_few_images_are_refused():
     refused("at least 20 images", height, lambda t: np.where(t < 0.9, height(t), np.nan))
 
