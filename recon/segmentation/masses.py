@@ -256,7 +256,7 @@ def _middles(dark: Mask, spacing: Array) -> Mask:
 
 def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
     """Indices of the voxel of a mask that is nearest to each."""
-    return tuple(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True))
+    return tuple(np.asarray(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True)))
 
 
 def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Mask:
