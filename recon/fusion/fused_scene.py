@@ -55,9 +55,11 @@ class FusedScene:
 
     @property
     def path(self) -> Array:
-        """Middles of the array's face : (m, 3) mm, of the B-scans with a pose."""
-        placed = np.isfinite(self.scans.world_from_pixel).all(axis=(1, 2))
-        return _faces_middle(self.scans.world_from_pixel[placed], self.scans.shape[1])
+        """Pieces : (m, 2, 3) mm of the way of the array's face, its middle, between B-scans in a row that both have a pose."""
+        face_row = 0.0 if self.scans.probe is None else self.scans.probe.face_row
+        middles = _faces_middle(self.scans.world_from_pixel, self.scans.shape[1], face_row)
+        pieces = np.stack([middles[:-1], middles[1:]], axis=1)
+        return pieces[np.isfinite(pieces).all(axis=(1, 2))]
 
 
 def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
@@ -70,7 +72,7 @@ def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
     made |= {name: painted(mass.mesh, IN_SPACE.mass) for name, mass in (scene.masses or {}).items()}
     for k in evenly(list(scene.images), scans):
         made[f"scan{k:04d}"] = scan_layer(scene.images[k], scene.scans.world_from_pixel[k])
-    if len(scene.path) > 1:
+    if len(scene.path):
         made["path"] = path_layer(scene.path)
     if scene.middle is not None and scene.scans.probe is not None:
         body, rings = probe_shape.of(scene.target, scene.scans.probe, scene.scans.shape[1])
@@ -99,12 +101,11 @@ def _scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
     return rigid.apply(world_from_pixel, np.column_stack([u, v, np.zeros(4)]))
 
 
-def path_layer(places: Array) -> trimesh.Trimesh:
-    """A tube along places : (n, 3) mm, n >= 2; where two coincide there is no piece."""
-    moved = np.linalg.norm(np.diff(places, axis=0), axis=1) > 1e-6
-    ends = zip(places[:-1][moved], places[1:][moved], strict=True)
+def path_layer(ends: Array) -> trimesh.Trimesh:
+    """A tube along pieces between ends : (n, 2, 3) mm, n >= 1; where both coincide there is no piece."""
+    moved = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 1e-6
     path_mm = 0.6  # radius of the path's tube
-    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends]
+    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends[moved]]
     whole = trimesh.util.concatenate(pieces)
     assert isinstance(whole, trimesh.Trimesh)
     return painted(whole, IN_SPACE.path)
@@ -150,6 +151,7 @@ def evenly(numbers: list[int], count: int) -> list[int]:
     )
 
 
-def _faces_middle(world_from_pixel: Array, width: int) -> Array:
-    """Middles of the array's face : (n, 3) mm, from matrices : (n, 4, 4) of B-scans as wide as some px."""
-    return world_from_pixel[:, :3, 0] * (width - 1) / 2 + world_from_pixel[:, :3, 3]
+def _faces_middle(world_from_pixel: Array, width: int, face_row: float) -> Array:
+    """Middles of the array's face : (n, 3) mm, from matrices : (n, 4, 4) of B-scans as wide as some px; NaN without a pose."""
+    there = world_from_pixel[:, :3, 0] * (width - 1) / 2 + world_from_pixel[:, :3, 3]
+    return there + world_from_pixel[:, :3, 1] * face_row if face_row else there

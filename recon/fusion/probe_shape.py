@@ -16,14 +16,15 @@ BOARD_MM, INK_MM = 3.0, 0.2  # thickness of the board, and of the circles on it
 
 
 def of(target: Target, probe: ProbeCalibration, width: int) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Board, bracket and housing; and the circles' ink. The array's face is the middle of B-scans `width` px wide, at row 0."""
+    """Board, bracket and housing; and the circles' ink. The array's face is the middle of B-scans `width` px wide."""
     x, y = target.board_mm
     middle = circle_layout.middle(target) - [0, 0, BOARD_MM / 2]
     board = trimesh.creation.box([x, y, BOARD_MM], rigid.transform(np.eye(3), middle))
     array = (width - 1) * probe.scale[0]
     housing_mm = (6.0, 45.0, 20.0)  # wider than the array, long and thick
     wider, length, thick = housing_mm
-    held = probe.target_from_image @ rigid.transform(np.eye(3), np.array([array / 2, -length / 2, 0.0]))
+    face = probe.face_row * probe.scale[1]
+    held = probe.target_from_image @ rigid.transform(np.eye(3), np.array([array / 2, face - length / 2, 0.0]))
     housing = trimesh.creation.box([array + wider, length, thick], held)
     strut_mm = 4.0  # radius of the bracket
     strut = trimesh.creation.cylinder(strut_mm, segment=[middle, held[:3, 3]], sections=16)

@@ -85,8 +85,8 @@ def _bodies(scene: FusedScene) -> Iterator[Shape]:
 
 def _wires(scene: FusedScene) -> Iterator[Lines]:
     """The path of the array's face, and the devices' views."""
-    if len(scene.path) > 1:
-        yield Lines("path", scene.path[None], ON_PAGE.path)
+    if len(scene.path):
+        yield Lines("path", scene.path, ON_PAGE.path)
     ray_mm = 60.0  # of a device, towards the corners of its view
     for name, camera in scene.devices.items():
         width, height = camera.size

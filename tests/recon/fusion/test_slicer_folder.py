@@ -16,7 +16,7 @@ from recon.files import volumes
 from recon.files.volumes import Volume
 from recon.freehand import sequences
 from recon.freehand.scans import Scans
-from recon.fusion import scene_page, slicer_folder
+from recon.fusion import probe_shape, scene_page, slicer_folder
 from recon.fusion.fused_scene import FusedScene
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
@@ -72,6 +72,21 @@ def test_the_probe_under_its_transform_is_where_its_array_met_the_skin(folder, s
     assert below.max() == pytest.approx(0, abs=1e-3), "nothing of it reaches into the tissue"
     at_face = local[np.abs(below) < 1e-3, 0]
     assert at_face.min() < 0 and at_face.max() > 29
+
+
+def test_the_path_does_not_cross_gaps_and_begins_at_the_face(scene):
+    """Between B-scans without a pose nothing was measured; on an uncropped screen the face isn't at row 0."""
+    matrices = scene.scans.world_from_pixel.copy()
+    matrices[2] = np.nan
+    lower = replace(scene.scans, world_from_pixel=matrices, probe=replace(scene.scans.probe, face_row=10.0))
+    pieces, face = replace(scene, scans=lower).path, np.array([14.5, 10.0, 0.0])
+    assert pieces.shape == (2, 2, 3)
+    assert pieces[0, 0] == pytest.approx(rigid.apply(matrices[0], face)) and pieces[1, 1] == pytest.approx(
+        rigid.apply(matrices[4], face)
+    )
+    housings = [probe_shape.of(scene.target, probe, 30)[0] for probe in (scene.scans.probe, lower.probe)]
+    moved = housings[1].vertices[8:16] - housings[0].vertices[8:16]
+    assert moved == pytest.approx(np.tile(10 * lower.probe.scale[1] * lower.probe.target_from_image[:3, 1], (8, 1)))
 
 
 def test_markups_lie_in_the_masses_and_hold_their_uncertainty(folder, scene):
