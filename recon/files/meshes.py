@@ -14,16 +14,16 @@ from trimesh.visual import ColorVisuals
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
-from recon.errors import InputError, reason
+from recon.errors import InputError, reason, short
 from recon.files import atomic
 from recon.files.regular import read_bytes
 
-# glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 LUMA = np.array([0.299, 0.587, 0.114])  # BT.601
 DAMAGE = (  # what trimesh raises on files damaged at random
     *(ValueError, LookupError, TypeError, AttributeError, OverflowError, MemoryError, EOFError, RuntimeError),
     *(NotImplementedError, AssertionError, ZeroDivisionError, NameError, struct.error),
 )
+# glTF is in metres with y up and the front towards +z; a camera's frame is in mm with y down and z away from it
 GLTF_FROM_WORLD = np.diag([0.001, -0.001, -0.001, 1.0])
 
 
@@ -43,12 +43,14 @@ def set_greys(mesh: trimesh.Trimesh, greys: NDArray[np.uint8]) -> None:
 def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
     """Read triangles from PLY, as `write_ply` leaves them; every number a vertex beside place and normal is a vertex attribute.
 
+    Vertices keep the file's order and number, those of no triangle included.
+
     expected : what the file is to be, for messages
 
     Raises
     ------
     InputError
-        If the file is missing or damaged, of another kind, or holds no triangles.
+        If the file is missing or damaged, of another kind, holds no triangles, or lacks a number for some vertices.
     """
     if path.suffix.lower() != ".ply":
         raise InputError(f"{path}: expected {expected} as PLY, found {path.suffix or 'no suffix'}")
@@ -56,7 +58,7 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+            mesh = trimesh.load(io.BytesIO(data), file_type="ply", process=False, fix_texture=False, skip_materials=True)
     except DAMAGE as error:
         raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
@@ -67,12 +69,20 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
         raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
-    stored = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    names = getattr(getattr(stored, "dtype", None), "names", None) or ()
+    stored = mesh.metadata["_ply_raw"]["vertex"]  # trimesh's own name, without a default: attributes would be lost in silence
     # of a vertex, for which meshes have their own places
     placed = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")
-    for name in (name for name in names if name not in placed):
-        mesh.vertex_attributes[name] = np.asarray(stored[name], float).ravel()
+    for name, kind in stored["properties"].items():
+        if name in placed or "," in kind:  # a list
+            continue
+        try:  # fields of an array where the file is binary, a map of columns where it is text, short ones if rows are
+            values = np.asarray(stored["data"][name], float).ravel()
+        except (LookupError, TypeError, ValueError):
+            values = np.empty(0)
+        if len(values) != len(mesh.vertices):
+            found = f"{len(values)} of {len(mesh.vertices)}: damaged?"
+            raise InputError(f"{path}: expected {expected} with {short(name)} of each vertex, found {found}")
+        mesh.vertex_attributes[name] = values
     return mesh
 
 

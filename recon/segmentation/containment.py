@@ -20,7 +20,7 @@ class Containment:
 
     depths: Array  # (n,) mm of the mesh's vertices, NaN where the nearest part of the surface is its rim
     normals: Array  # (n, 3) of the surface over them, towards the camera
-    sigmas_mm: Array  # (n,) of the surface there; zero where it isn't known
+    sigmas_mm: Array  # (n,) of the surface there; NaN where it isn't known
 
     @property
     def covered(self) -> float:
@@ -44,8 +44,8 @@ class Containment:
 
     @property
     def sigma_mm(self) -> float:
-        """Standard deviation of the surface over that vertex."""
-        return float(self.sigmas_mm[self.nearest]) if self.covered > 0 else 0.0
+        """Standard deviation of the surface over that vertex; NaN where it isn't known."""
+        return float(self.sigmas_mm[self.nearest]) if self.covered > 0 else float("nan")
 
     @property
     def inside(self) -> bool | None:
@@ -92,7 +92,7 @@ def below(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0
     away = vertices - np.asarray(camera, float)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera
     behind = -((points - vertices) * normals).sum(axis=1)  # from the tangent plane there
-    sigmas = np.nan_to_num(np.asarray(surface.vertex_attributes.get("sigma_mm", np.zeros(len(surface.vertices))), float).ravel())
+    sigmas = np.asarray(surface.vertex_attributes.get("sigma_mm", np.full(len(surface.vertices), np.nan)), float).ravel()
     return np.where(_on_rim(surface, nearest), np.nan, behind), normals, sigmas[nearest]
 
 

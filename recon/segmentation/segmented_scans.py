@@ -103,7 +103,8 @@ def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
         return text
     if under.inside is None:
         return f"{text}, inside unknown: only {100 * under.covered:.0f} % lies under the surface"
-    return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.2f')}{deep} mm below the skin"
+    doubt = ", which has no sigma_mm there: uncertain by an unknown length" if np.isnan(under.sigma_mm) else ""
+    return f"{text}, {'inside' if under.inside else 'not inside'}, {shown(under.least_mm, '.2f')}{deep} mm below the skin{doubt}"
 
 
 def find_tube(

@@ -1,10 +1,13 @@
 """Does an object lie under the surface that the cameras saw?"""
 
+import re
+
 import numpy as np
 import pytest
 import trimesh
 
-from recon.segmentation.containment import below, contain
+from recon.errors import InputError
+from recon.segmentation.containment import below, contain, read_skin
 
 DOME_MM, MIDDLE = 60.0, np.array([5.0, -3.0, 690.0])
 
@@ -56,3 +59,50 @@ def test_less_than_half_under_the_surface_is_not_enough_to_tell(dome):
     hardly, piercing = contain([under, through], dome)
     assert 0 < hardly.covered < 0.5 and hardly.least_mm > 0 and hardly.inside is None
     assert 0 < piercing.covered < 0.5 and piercing.inside is False
+
+
+SQUARE = """ply
+format ascii 1.0
+element vertex 5
+property float x
+property float y
+property float z
+property float s
+property float t
+property float sigma_mm
+element face 2
+property list uchar int vertex_indices
+end_header
+9 9 9 0 0 0.9
+0 0 0 0 0 0.1
+1 0 0 1 0 0.2
+0 1 0 0 1 0.3
+1 1 0 1 1 0.4
+3 1 2 3
+3 2 4 3
+"""
+
+
+def test_each_vertex_of_a_foreign_skin_keeps_its_sigma(tmp_path):
+    """Text with places in a texture and a vertex of no triangle, as other software writes it, here and once more in binary."""
+    (tmp_path / "text.ply").write_text(SQUARE)
+    head, body = SQUARE.replace("ascii", "binary_little_endian").split("end_header\n")
+    lines = body.splitlines()
+    vertices = np.array([line.split() for line in lines[:5]], "<f4").tobytes()
+    faces = np.array([(3, [int(n) for n in line.split()[1:]]) for line in lines[5:]], [("n", "u1"), ("corners", "<i4", 3)])
+    (tmp_path / "binary.ply").write_bytes(f"{head}end_header\n".encode() + vertices + faces.tobytes())
+    for name in ("text.ply", "binary.ply"):
+        skin = read_skin(tmp_path / name)
+        (first, *_), (x, *_) = skin.vertex_attributes["sigma_mm"], skin.vertices[0]
+        assert (first, x) == (pytest.approx(0.9), 9), name
+        _, _, sigmas = below(np.array([[0.1, 0.1, 5], [0.9, 0.9, 5]]), skin)
+        assert sigmas == pytest.approx([0.1, 0.4]), name
+
+
+def test_a_skin_that_lacks_the_sigma_of_a_vertex_is_refused(tmp_path):
+    """Of one vertex, or of all that its head announces one for."""
+    path = tmp_path / "skin.ply"
+    for missing in (r" 0\.3$", r" 0\.\d$"):
+        path.write_text(re.sub(missing, "", SQUARE, flags=re.MULTILINE))
+        with pytest.raises(InputError, match=r"^[^\n]*skin\.ply: expected a surface [^\n]*sigma_mm of each vertex, found"):
+            read_skin(path)

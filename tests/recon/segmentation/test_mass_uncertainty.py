@@ -157,6 +157,10 @@ def test_depth_below_the_skin_is_as_uncertain_as_skin_and_border(rig, tmp_path):
     assert under.least_mm == pytest.approx(9 - RADIUS_MM, abs=0.05)
     sigma = mass_uncertainty.by_all(mass, placed(scans, shift_mm=0.1, shared=True), STILL, under)
     assert sigma.depth_mm == pytest.approx(np.sqrt(0.1**2 + 0.05**2 + mass_uncertainty.BORDER_MM**2), rel=0.02)
+    del skin.vertex_attributes["sigma_mm"]  # as of other software: unknown, not exact
+    (under,) = contain([mass.mesh], skin, centre - [0, 0, 500])
+    unknown = mass_uncertainty.by_all(mass, placed(scans, shift_mm=0.1, shared=True), STILL, under)
+    assert np.isnan(unknown.depth_mm) and unknown[:2] == sigma[:2]
 
 
 def test_b_scans_between_the_same_poses_err_together(rig, sharp):

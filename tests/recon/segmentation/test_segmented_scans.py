@@ -26,6 +26,17 @@ def test_whether_a_mass_is_inside_may_be_unknown():
     assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
 
 
+def test_a_skin_of_unknown_uncertainty_is_named_beside_the_depth():
+    """A depth below it has no standard deviation, where one below a skin of none beside the border's has."""
+    mass = Mass(trimesh.creation.icosphere(radius=3))
+    count = len(mass.mesh.vertices)
+    depths, normals = np.full(count, 2.0), np.tile([0.0, 0.0, -1.0], (count, 1))
+    known, unknown = (Containment(depths, normals, np.full(count, sigma)) for sigma in (0.0, np.nan))
+    assert segmented_scans.describe(mass, Sigma(0.5, 10.0, 0.3), known).endswith("inside, 2.00 ± 0.30 mm below the skin")
+    said = segmented_scans.describe(mass, Sigma(0.5, 10.0), unknown)
+    assert "2.00 mm below the skin, which has no sigma_mm there" in said
+
+
 def test_a_cover_stands_beside_its_tube():
     """Both over the same length, with the wall in figures and on the console."""
     axis, ends = np.array([1.0, 0, 0]), np.array([[-20.0, 0, 600], [20, 0, 600]])
