@@ -18,6 +18,7 @@ from recon.capture.camera_dialects import Content
 from recon.capture.manifest import SCANNER, read_manifest
 from recon.errors import InputError, short
 from recon.files import opencv_storage
+from recon.geometry.lens_domain import is_one_to_one
 from recon.model import lengths
 from recon.model.calibration import Calibration
 from recon.model.lengths import UNIT_KEY
@@ -28,7 +29,7 @@ DIALECTS = "recon.capture.calibration_dialects"  # a module each
 
 
 def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
-    """Read a calibration file of any of the dialects.
+    """Read a calibration file of any of the dialects; warns of a lens that folds within its image.
 
     Parameters
     ----------
@@ -45,7 +46,12 @@ def read(path: Path, sizes: Mapping[str, tuple[int, int]] | None = None) -> Cali
     if len(known) > 1:
         raise InputError(f"{path}: expected files of {' or of '.join(known)}, found both; leave one kind")
     for dialect in known.values():
-        return dialect.read(content, sizes or {})
+        found = dialect.read(content, sizes or {})
+        for name, camera in found.cameras.items():
+            if camera.distortion.any() and not is_one_to_one(camera, margin=0):
+                cause = "coefficients of another model or in another order, or of points that left out the corners"
+                log.warning("%s: %s: the lens folds within the image, where pixels have no ray: %s?", path, name, cause)
+        return found
     found = short(", ".join(content.checked_values())) or "no keys"
     told = [getattr(dialect, "TOLD_BY", f"a file of {name}") for name, dialect in registry.kinds(DIALECTS).items()]
     raise InputError(f"{path}: expected {', or '.join(told)}, found {found}")

@@ -25,11 +25,15 @@ ACCEPTED = 1e-10  # the same, of a root that rounding keeps from the tolerance
 FEW = 16  # points: threads take longer to wake than one core takes to undistort these
 FEW_PROJECTED = 1000  # the same to distort them, array by array
 SLOPE_STEP = 1e-6  # normalised image coordinates: to each side, of the Jacobian by central differences
+FARTHEST = 21  # place of the square of a lens's largest radius among its coefficients
+STEEPEST, ANGLES = 89.5, 400  # deg from the axis up to which a lens is followed, and steps to there
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
     """A calibrated pinhole camera with OpenCV distortion; the projector is one too, run backwards.
+
+    Its arrays are copies, and can't be written to.
 
     Raises
     ------
@@ -47,14 +51,14 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", arguments.image_size("size", self.size))
         for name, shape in (("matrix", (3, 3)), ("camera_from_world", (4, 4))):
-            value = np.asarray(arguments.numbers(name, getattr(self, name), shape, finite=False), float)
+            value = np.array(arguments.numbers(name, getattr(self, name), shape, finite=False), float)
             if not np.isfinite(value).all():
                 raise ValueError(f"{name}: expected a finite {shape[0]}x{shape[1]} matrix, found {value.tolist()}")
-            object.__setattr__(self, name, value)
-        distortion = np.asarray(arguments.numbers("distortion", self.distortion, finite=False), float).ravel()
+            object.__setattr__(self, name, _fixed(value))
+        distortion = np.array(arguments.numbers("distortion", self.distortion, finite=False), float).ravel()
         if distortion.size not in DISTORTION_LENGTHS or not np.isfinite(distortion).all():
             raise ValueError(f"distortion: expected 0, 4, 5, 8, 12 or 14 finite coefficients, found {distortion.tolist()}")
-        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "distortion", _fixed(distortion))
         if self.matrix[0, 0] <= 0 or self.matrix[1, 1] <= 0:
             raise ValueError(f"matrix: expected positive focal lengths, found {self.matrix[0, 0]:g}, {self.matrix[1, 1]:g}")
         if np.abs(self.matrix[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1]).max() > rigid.EXACT:
@@ -69,19 +73,27 @@ class Camera:
 
     @cached_property
     def coefficients(self) -> Array:
-        """The distortion in a fixed layout for compiled code : (21,), 12 coefficients and the 3x3 tilt matrix, row by row."""
+        """The distortion in a fixed layout for compiled code : (22,), 12 coefficients, the 3x3 tilt matrix, row by row, and the
+        square of the radius up to which the lens is one: see `largest_radius`.
+        """
         padded = np.zeros(14)
         padded[: self.distortion.size] = self.distortion
         tilt = tilt_matrix(padded[12], padded[13]) if padded[12:].any() else np.eye(3)
-        return np.concatenate([padded[:12], tilt.ravel()])
+        return _fixed(np.concatenate([padded[:12], tilt.ravel(), [largest_radius(padded) ** 2]]))
 
     def project(self, points: ArrayLike) -> Array:
-        """Project points : (..., 3) mm in the world, to pixels : (..., 2). Points behind the camera give NaN."""
+        """Project points : (..., 3) mm in the world, to pixels : (..., 2).
+
+        Points behind the camera give NaN, and those so far aside that the lens model has turned back: see `largest_radius`.
+        """
         local = rigid.apply(self.camera_from_world, points)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             normalised = np.where(local[..., 2:] > 0, local[..., :2] / local[..., 2:], np.nan)
             if normalised.size <= 2 * FEW_PROJECTED:
-                bent = np.stack(distorted(normalised[..., 0], normalised[..., 1], self.coefficients), axis=-1)
+                x, y = normalised[..., 0], normalised[..., 1]
+                bent = np.stack(distorted(x, y, self.coefficients), axis=-1)
+                if (farthest := self.coefficients[FARTHEST]) < np.inf:
+                    bent[x * x + y * y > farthest] = np.nan
             else:
                 flat, bent, k = np.ascontiguousarray(normalised.reshape(-1, 2)), np.empty(normalised.shape), self.coefficients
                 in_threads(_distort_all, len(flat), flat, k, bent.reshape(-1, 2))
@@ -91,7 +103,7 @@ class Camera:
         """Undo lens and matrix: pixels : (..., 2), to normalised coordinates x/z, y/z : (..., 2) of the ideal pinhole.
 
         The forward model is inverted by Newton's method, to 1e-13 in normalised coordinates. A pixel that no ray reaches
-        (outside the range where the polynomial can be inverted) gives NaN.
+        (outside the range where the polynomial can be inverted, or by rays past its turn alone) gives NaN.
         """
         pixels = np.asarray(pixels, float)
         flat = pixels.reshape(-1, 2)
@@ -127,6 +139,36 @@ class Camera:
         return distorted @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
 
+def _fixed(values: Array) -> Array:
+    """The array itself, which can't be written to any more."""
+    values.setflags(write=False)
+    return values
+
+
+def largest_radius(k: Array) -> float:
+    """The radius, in normalised image coordinates, up to which a lens of coefficients k : (12 or more,) is one.
+
+    Beyond it distorted rays turn back towards the image's middle (a fold) or come from infinity (a pole): the polynomial says
+    nothing of a lens there. Decentring and prism make that radius depend on the direction: it is that of the last to turn.
+    Infinite where none does.
+    """
+
+    def bent(r: Array) -> Array:
+        r2 = r * r
+        radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+        return r * radial + r2 * (np.hypot(3 * k[3] + k[8], 3 * k[2] + k[10]) + r2 * np.hypot(k[9], k[11]))
+
+    radii = np.tan(np.radians(np.linspace(0, STEEPEST, ANGLES + 1)))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for _ in range(3):  # the last step, again in fine ones
+            back = ~(np.diff(bent(radii)) > 0)
+            if not back.any():
+                return np.inf
+            turn = int(back.argmax())
+            radii = np.linspace(radii[max(turn - 1, 0)], radii[turn + 1], ANGLES + 1)
+    return float(radii[turn])
+
+
 def tilt_matrix(tau_x: float, tau_y: float) -> Array:
     """Homography : (3, 3) of a sensor tilted by tau_x, tau_y in rad (Scheimpflug), as in OpenCV's camera model."""
     cx, sx, cy, sy = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
@@ -138,7 +180,7 @@ def tilt_matrix(tau_x: float, tau_y: float) -> Array:
 
 
 def distorted(x, y, k):
-    """Distort a normalised point by the coefficients k : (21,) of `Camera.coefficients`; anything with arithmetic will do."""
+    """Distort a normalised point by the coefficients k : (22,) of `Camera.coefficients`; anything with arithmetic will do."""
     r2 = x * x + y * y
     radial = (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
     xd = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x) + r2 * (k[8] + r2 * k[9])
@@ -154,7 +196,10 @@ distort_side_by_side = njit(inline="always")(distorted)  # by Numba: its points 
 @kernel
 def _distort_all(first, end, points, k, found):
     for i in range(first, end):
-        found[i, 0], found[i, 1] = distort(points[i, 0], points[i, 1], k)
+        x, y = points[i, 0], points[i, 1]
+        xd, yd = distort(x, y, k)
+        inside = x * x + y * y <= k[FARTHEST]
+        found[i, 0], found[i, 1] = xd if inside else np.nan, yd if inside else np.nan
 
 
 @njit(forceinline=True, error_model="numpy")
@@ -189,7 +234,7 @@ def _undistort_from(x, y, u, v, k):
         a, b, c, d = distortion_slopes(x, y, k)
         determinant = a * d - b * c
     # past the fold of a polynomial a root is not a ray: the distortion mirrors there, or throws to the other side
-    if error < ACCEPTED and x * u + y * v >= 0 and determinant > 0:
+    if error < ACCEPTED and x * u + y * v >= 0 and determinant > 0 and x * x + y * y <= k[FARTHEST]:
         return x, y
     return np.nan, np.nan
 
@@ -244,7 +289,7 @@ def _continued(row, before, last, v, matrix, k, doubtful):
         x, y = x + a * right + b * down, y + c * right + d * down
         xd, yd = distort_side_by_side(x, y, k)
         near = (abs(u - xd) <= NEWTON_TOLERANCE) & (abs(v - yd) <= NEWTON_TOLERANCE)
-        doubtful[i] = not (near & (x * u + y * v >= 0) & (a * d > b * c))
+        doubtful[i] = not (near & (x * u + y * v >= 0) & (a * d > b * c) & (x * x + y * y <= k[FARTHEST]))
         row[0, i], row[1, i] = x, y
     for i in range(width):
         if doubtful[i]:

@@ -38,7 +38,7 @@ class _Device(NamedTuple):
     """A camera for compiled code."""
 
     matrix: Array  # (3, 3) px
-    coefficients: Array  # (21,) as `Camera.coefficients`
+    coefficients: Array  # (22,) as `Camera.coefficients`
     tilts: Array  # (2, 3, 3) derivatives of the tilt's homography by its angles
     turn: Array  # (3, 3) from the world's axes to the camera's
 
@@ -72,7 +72,7 @@ def _derivatives(turned, local, device, parameters):
     The pixels, and their derivatives by the point : (m, 2, 3) and, where asked for, by all PARAMETERS : (m, 2, 24).
     """
     fx, skew, fy = device.matrix[0, 0], device.matrix[0, 1], device.matrix[1, 1]
-    turn, t = device.turn, device.coefficients[12:].copy().reshape((3, 3))
+    turn, t = device.turn, device.coefficients[12:21].copy().reshape((3, 3))
     m = len(local)
     pixels, by_point, by_parameter = np.empty((m, 2)), np.empty((m, 2, 3)), np.zeros((m if parameters else 0, 2, TURNS + 6))
     slopes, by_local, by_coefficient = np.empty((2, 2)), np.empty((2, 3)), np.zeros((12, 2))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon import arguments
 from recon.compiled import njit
 from recon.errors import Implausible, InputError, refuse_or_warn
-from recon.geometry.camera import Camera, distort_side_by_side
+from recon.geometry.camera import FARTHEST, Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 from recon.threads import in_threads
 
@@ -93,7 +93,7 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera, 
     PointMap
         Points solved to 1e-6 projector px. sigma is the standard deviation of the position along the camera's ray that the
         map's sigma causes, `1 / sqrt((du/dt / sigma_u)^2 + (dv/dt / sigma_v)^2)`, in mm. NaN where nothing was decoded, where
-        the solution lies behind a device, or where there is none.
+        the solution lies behind a device or past its lens's turn, or where there is none.
 
     Raises
     ------
@@ -203,7 +203,9 @@ def _triangulate(first, end, rays, centre, projector, decoded, points, sigma):
         for i in range(width):
             curvature = wu[i] * su[i] * su[i] + wv[i] * sv[i] * sv[i]
             missing = (wu[i] * su[i] * (column[i] - u[i]) + wv[i] * sv[i] * (row[i] - v[i])) / curvature
-            solved = abs(missing) * (abs(su[i]) + abs(sv[i])) < TOLERANCE and t[i] > 0 and oz + t[i] * ez[i] > 0
+            x, y, z = ox + t[i] * ex[i], oy + t[i] * ey[i], oz + t[i] * ez[i]
+            solved = abs(missing) * (abs(su[i]) + abs(sv[i])) < TOLERANCE and t[i] > 0 and z > 0
+            solved &= x * x + y * y <= coefficients[FARTHEST] * z * z  # past the lens's turn others than the ray's point are seen
             distance = t[i] if solved else np.nan
             points[j, i, 0] = centre[0] + distance * rays[j, i, 0]
             points[j, i, 1] = centre[1] + distance * rays[j, i, 1]

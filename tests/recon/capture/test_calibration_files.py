@@ -124,6 +124,15 @@ def test_cameras_whose_names_are_exchanged_are_named(optics, tmp_path, caplog):
     assert "expected cam1 where the world begins, found cam2 there: are their names exchanged?" in caplog.text
 
 
+def test_a_lens_that_folds_within_its_image_is_named(optics, tmp_path, caplog):
+    """k1 and k2 exchanged: r (1 - 8 r^2) turns back at 0.2, and the image's corner lies at 0.25; r (1 - 8 r^4) turns at 0.4."""
+    for k, said in (([-0.4, -8, 0, 0], 0), ([-8, -0.4, 0, 0], 1)):
+        bent = replace(optics.cameras["cam2"], distortion=np.array(k))
+        calibration_files.write(tmp_path / "optics.yaml", Calibration({"cam1": optics.cameras["cam1"], "cam2": bent}))
+        calibration_files.read(tmp_path / "optics.yaml")
+        assert caplog.text.count("cam2: the lens folds within the image, where pixels have no ray") == said
+
+
 def test_lenses_that_were_left_out_are_named(optics, tmp_path, caplog):
     """Of a rectified pair, both of one matrix, there are none."""
     straight = {name: replace(camera, distortion=np.zeros(5)) for name, camera in optics.cameras.items()}
@@ -215,8 +224,8 @@ def test_what_a_layout_has_no_place_for_is_refused(layout, coefficients, complai
     optics = Calibration({"cam1": device("cam1", 1, coefficients), "projector": device("projector", 3)})
     with pytest.raises(InputError, match=complaint):
         dialect(layout).write(tmp_path, optics)
-    skew = device("cam1", 1, 4)
-    skew.matrix[0, 1] = 0.5
+    plain = device("cam1", 1, 4)
+    skew = replace(plain, matrix=plain.matrix + 0.5 * np.eye(3, k=1) * [[1], [0], [0]])
     if layout != "slstudio":
         with pytest.raises(InputError, match=r"cam1.matrix: expected no skew, .* found 0.5"):
             dialect(layout).write(tmp_path, Calibration({"cam1": skew, "projector": device("projector", 3, 4)}))

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.geometry import rigid
-from recon.geometry.camera import FEW, FEW_PROJECTED, Camera
+from recon.geometry.camera import FEW, FEW_PROJECTED, Camera, distorted
 
 MATRIX = np.array([[3320.0, 0, 618], [0, 3331, 523], [0, 0, 1]])
 WIDE = np.array([[1250.0, 0, 650], [0, 1240, 500], [0, 0, 1]])
@@ -99,6 +99,59 @@ def test_unreachable_pixels_give_nan():
     assert np.isfinite(normalised[0]).all() and np.isnan(normalised[1]).all()
     rays, each = camera.pixel_rays(), camera.rays(camera.pixel_grid())
     assert np.array_equal(np.isnan(rays), np.isnan(each)) and np.nanmax(np.abs(rays - each)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("distortion", "turn"),
+    [
+        ([-0.4, 0, 0, 0], np.sqrt(1 / 1.2)),  # r (1 - 0.4 r^2)
+        ([-0.5, 0.1, 0, 0], 1.0),  # r (1 - r^2 / 2 + r^4 / 10) turns back at 1 and outwards again at sqrt 2
+    ],
+)
+def test_a_lens_ends_where_its_radius_turns(distortion, turn, rng):
+    """Few points or many, up to there each comes back along its ray; past it no pixel has a ray and no ray a pixel."""
+    camera = Camera((1280, 1024), WIDE, np.array(distortion))
+    angles, shares = rng.uniform(0, 2 * np.pi, 2 * FEW_PROJECTED), rng.uniform(0.01, 3, 2 * FEW_PROJECTED)
+    shares = shares[np.abs(shares - 1) > 1e-3]
+    ways = np.column_stack([np.cos(angles), np.sin(angles)])[: len(shares)]
+    points = np.column_stack([turn * shares[:, None] * ways, np.ones(len(shares))])
+    inside = shares < 1
+    for part in (slice(None), slice(50)):
+        pixels = camera.project(points[part])
+        assert np.array_equal(np.isfinite(pixels).all(axis=-1), inside[part]) and np.isnan(pixels[~inside[part]]).all()
+        assert np.abs(camera.undistort(pixels) - points[part, :2])[inside[part]].max() < 1e-6
+    beyond = camera.to_pixels(np.stack(distorted(*points[~inside, :2].T, camera.coefficients), axis=-1))
+    found = camera.undistort(beyond)
+    assert (np.linalg.norm(found[np.isfinite(found).all(axis=1)], axis=1) <= turn).all()
+
+
+def test_no_ray_is_found_on_the_outer_branch_of_a_lens():
+    """r (1 - r^2 / 2 + r^4 / 10) reaches 0.6 at 1, and 0.8 once more at 1.82."""
+    camera = Camera((1280, 1024), WIDE, np.array([-0.5, 0.1, 0, 0]))
+    pixels = camera.to_pixels(np.column_stack([[0.55, 0.62, 0.7, 0.8], np.zeros(4)]))
+    assert np.isnan(camera.undistort(pixels)).all(axis=1).tolist() == [False, True, True, True]
+
+
+def test_decentring_ends_a_lens_where_it_turns_last():
+    """The image's corner that a lens without decentring would have turned before: it is sound there, so it has its pixel."""
+    turn = np.sqrt(1 / 1.2)
+    camera = Camera((1280, 1024), WIDE, np.array([-0.4, 0, 0, 0.004]))
+    assert np.isfinite(camera.project([[1.004 * turn, 0, 1], [-0.98 * turn, 0, 1]])).all()
+    assert np.isnan(camera.project([[1.02 * turn, 0, 1], [-1.02 * turn, 0, 1]])).all()
+
+
+def test_a_camera_keeps_its_values():
+    """Whatever becomes of the arrays that it was made of, and not by an assignment that its cached layout would miss."""
+    matrix, distortion, pose = WIDE.copy(), np.array([-0.1, 0, 0, 0]), np.eye(4)
+    camera = Camera((1280, 1024), matrix, distortion, pose)
+    before = camera.project([[0.5, 0.2, 1.0]])
+    for array in (matrix, distortion, pose):
+        array *= 3
+    assert np.array_equal(camera.project([[0.5, 0.2, 1.0]]), before)
+    for kept in (camera.matrix, camera.distortion, camera.camera_from_world, camera.coefficients):
+        with pytest.raises(ValueError, match="read-only"):
+            kept[0] = 1
+    assert camera != Camera((1280, 1024), WIDE, distortion)  # by identity, as arrays have no truth value
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,13 @@
 """Triangulation against points that were put there: synthetic projector maps of a known surface through strong lenses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
+from recon.geometry.camera_jacobian import linearise
 from recon.structured_light.triangulate import PointMap, Triangulator, triangulate
 from tests.recon.fringe_scenes import projector_map
 
@@ -50,6 +53,21 @@ def test_points_come_back(devices, axes):
     sigma = sigmas(points.shape[:2], **dict.fromkeys(axes.split(), 0.02))
     result = triangulate(projector_map(**coordinates(points, projector, axes), **sigma), camera, projector)
     assert np.abs(result.points - points).max() < 1e-4
+
+
+def test_no_point_is_found_past_the_projectors_turn(devices):
+    """r (1 - 4 r^2) turns back at 0.29, within the picture: past it the projector has no ray, and a coordinate that is read there
+    is another ray's.
+    """
+    camera, projector = devices[0], replace(devices[1], distortion=np.array([-4.0, 0, 0, 0]))
+    points = surface_points(camera)
+    pixels = linearise(projector, points.reshape(-1, 3), ()).pixels.reshape(*points.shape[:2], 2)
+    seen = np.isfinite(projector.project(points)).all(axis=-1)
+    assert 0.1 < seen.mean() < 0.9
+    result = triangulate(projector_map(columns=pixels[..., 0], rows=pixels[..., 1]), camera, projector, "take").points
+    known = np.isfinite(result).all(axis=-1)
+    assert np.isfinite(projector.project(result[known])).all() and known[seen].mean() > 0.9
+    assert np.abs(result - points)[known & seen].max() < 1e-2
 
 
 def test_predicted_sigma_is_the_scatter_along_the_ray(devices):
