@@ -19,7 +19,7 @@ RANK = 1e-7  # least ratio of singular values of rows
 
 
 class Undetermined(ValueError):
-    """Rows that do not determine the unknowns."""
+    """Measurements that do not determine the unknowns, or contradict each other; the words tell the cause."""
 
 
 class Rows(NamedTuple):

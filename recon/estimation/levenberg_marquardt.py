@@ -4,7 +4,6 @@ Source: Levenberg 1944; Marquardt 1963 for the damping by tens. SciPy's `least_s
 """
 
 from collections.abc import Callable
-from math import inf
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 Estimate = TypeVar("Estimate")
@@ -12,6 +11,7 @@ Step = TypeVar("Step")
 SomeStep = TypeVar("SomeStep", covariant=True)
 
 LEAST_DAMPING, LAST_DAMPING = 1e-4, 1e8  # after the first step uphill, and where there is no way down
+ROUNDING = 1e-14  # of the cost at the start: a rise that says nothing of the way
 
 
 class Rules(NamedTuple):
@@ -34,7 +34,7 @@ class LinearSystem(Protocol[SomeStep]):
     """A problem linearised at an estimate, as of `recon.estimation.equations`."""
 
     def step(self, damping: float) -> SomeStep:
-        """Solve with the diagonal times `1 + damping`; may raise `Unreachable`."""
+        """Solve with the diagonal times `1 + damping`; may raise `Unreachable`, and anything else ends the descent."""
         ...
 
 
@@ -47,7 +47,7 @@ class Descent(NamedTuple, Generic[Estimate, System, Step]):
     estimate: Estimate  # of least cost
     system: System  # the problem linearised there
     step: Step | None  # the first step that was settled, not taken; None where the cost converged or steps ran out
-    converged: bool  # a step was settled, the cost stayed, or the shortest step led uphill; else steps ran out or led nowhere
+    converged: bool  # a step was settled, or the cost stayed; else steps ran out, or none led down though the equations say so
 
 
 def descend(
@@ -70,6 +70,7 @@ def descend(
     """
     estimate, damping, converged = start, rules.damping, False
     system, cost = linearise(estimate)
+    first = cost
     for _ in range(rules.steps):
         if converged or damping > LAST_DAMPING:
             break
@@ -82,10 +83,11 @@ def descend(
             damping = max(10 * damping, LEAST_DAMPING)
             continue
         following, new = linearise(trial)
-        converged = abs(cost - new) < rules.converged * cost
         if new < cost + rules.rounding:
+            converged = abs(cost - new) < rules.converged * cost
             estimate, system, cost, damping = trial, following, new, damping / 10
-        else:
+        else:  # of a wrong slope a short step rises as little as it is short
+            converged = (new - cost) * max(1, damping) < rules.converged * cost
             damping = max(10 * damping, LEAST_DAMPING)
-            converged = converged or (damping > LAST_DAMPING and new < inf)
+            converged = converged or (damping > LAST_DAMPING and new - cost <= ROUNDING * first)
     return Descent(estimate, system, None, converged)

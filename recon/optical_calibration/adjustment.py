@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.estimation.covariance import inverse, marginal, propagate
-from recon.estimation.equations import Step
+from recon.estimation.equations import Step, Undetermined
 from recon.estimation.levenberg_marquardt import Descent, Rules, descend
 from recon.geometry import rigid
 from recon.geometry.board_shape import AS_DESIGNED, Tolerances
@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 OUTLIER = 6.0  # normalised residual of a sighting that is named an outlier; 1 Gaussian one in 7e7 is beyond
 MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a vector of two standard normal numbers
-LEAST_NOISE = 1e-3  # of the noise that was assumed
+LEAST_NOISE = 1e-3  # of the noise that the detection predicts: what is more exact counts as no more
 MAX_ROUNDS, MAX_ROUGH = 10, 5  # of measuring the noise
 SIMILAR_NOISE, SAME_NOISE = 0.2, 0.01  # relative change of the noise by which rough rounds end, and by which all do
 TIGHTER, TIGHTEST = 2.0, 1e6  # by which a lens is held that has a pole or a fold: times this each time, and at most
@@ -101,7 +101,7 @@ def adjust(
 
     Raises
     ------
-    ValueError
+    Undetermined
         If the observations don't determine the unknowns.
     """
     offsets = np.zeros_like(observations.pixels) if offsets is None else offsets
@@ -136,7 +136,7 @@ class Fit(NamedTuple):
 
     estimate: Estimate
     noise: Array  # (d,) of the devices, measured over predicted by the detection
-    converged: bool  # the last descent
+    converged: bool  # the last descent, and the noise
 
 
 def fit(problem: Problem, start: Estimate, noise: Array | None = None, converged: float = CONVERGED) -> Fit:
@@ -148,16 +148,16 @@ def fit(problem: Problem, start: Estimate, noise: Array | None = None, converged
     noise : (d,) if it is nearly known, and the start near.
     converged : relative change of the cost.
     """
-    rough, estimate, arrived = noise is None, start, False
+    rough, estimate = noise is None, start
     noise = np.ones(len(problem.observations.devices)) if noise is None else noise
     for number in range(MAX_ROUNDS):
         found = _descend(problem, estimate, noise, ROUGH if rough else FINE._replace(converged=converged))
-        factor = _measured_noise(found.system, problem)
-        estimate, noise, arrived, change = found.estimate, noise * factor, found.converged, np.abs(factor - 1).max()
+        factor = np.maximum(_measured_noise(found.system, problem), LEAST_NOISE / noise)
+        estimate, noise, change = found.estimate, noise * factor, np.abs(factor - 1).max()
         if change < SAME_NOISE and not rough:
-            break
+            return Fit(estimate, noise, found.converged)
         rough = rough and change > SIMILAR_NOISE and number < MAX_ROUGH
-    return Fit(estimate, noise, arrived)
+    return Fit(estimate, noise, False)
 
 
 def _one_to_one(problem: Problem, start: Estimate) -> tuple[Problem, Fit]:
@@ -202,10 +202,10 @@ def _measured_noise(system: System, problem: Problem) -> Array:
     unknowns = len(problem.names) + board + 6 * np.count_nonzero(used.any(axis=(1, 2)))
     left = 1 - unknowns / max(2 * np.count_nonzero(used), 1)
     if left <= 0:
-        raise ValueError("fewer observations than unknowns")
+        raise Undetermined("fewer observations than unknowns")
     lengths = [system.lengths[:, :, d][used[:, :, d]] for d in range(used.shape[2])]
     factors = [np.median(length) / MEDIAN / np.sqrt(left) if length.size else 1.0 for length in lengths]
-    return np.maximum(factors, LEAST_NOISE)
+    return np.array(factors)
 
 
 def board_information(adjusted: Adjustment) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from recon.estimation.equations import Undetermined
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.optical_calibration.bundle import Array, Estimate
@@ -29,7 +30,7 @@ def estimate(observations: Observations, light: str = "") -> Estimate:
 
     Raises
     ------
-    ValueError
+    Undetermined
         If a device sees too little, or stands elsewhere in too many poses.
     """
     cameras: dict[str, Camera] = {}
@@ -47,7 +48,7 @@ def estimate(observations: Observations, light: str = "") -> Estimate:
         poses[missing] = rigid.invert(cameras[device].camera_from_world) @ boards[missing]
         known |= missing
     if not known.all():
-        raise ValueError(f"pose {observations.poses[int(np.argmin(known))]} is seen by no device")
+        raise Undetermined(f"pose {observations.poses[int(np.argmin(known))]} is seen by no device")
     return Estimate(cameras, poses, observations.points)
 
 
@@ -56,15 +57,15 @@ def alone(observations: Observations, number: int) -> tuple[Camera, Array]:
     seen = observations.seen[:, :, number]
     enough = np.flatnonzero(seen.sum(axis=1) >= ENOUGH)
     if len(enough) < 3:
-        raise ValueError(f"{observations.devices[number]}: expected 3 poses or more with {ENOUGH} points, found {len(enough)}")
+        raise Undetermined(f"{observations.devices[number]}: expected 3 poses or more with {ENOUGH} points, found {len(enough)}")
     objects = [np.float32(observations.points[seen[k]]) for k in enough]
     pixels = [np.float32(observations.pixels[k, seen[k], number]) for k in enough]
     size = observations.sizes[number]
     with opencv_on_one_thread():
         trials = [_zhang(objects, pixels, size, height) for height in HEIGHTS]
     _, matrix, distortion, turns, shifts = min(trials, key=lambda trial: trial[0])
-    if matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-        raise ValueError(
+    if not (np.isfinite(matrix).all() and np.isfinite(distortion).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        raise Undetermined(
             f"{observations.devices[number]}: expected views of one flat board, found no camera that gives them: "
             "are the boards all parallel, or is the board another one?"
         )
@@ -86,13 +87,13 @@ def _placed(camera: Camera, boards: Array, reference: Array, device: str, causes
     """A device in the frame of the first: the median over the poses that both see."""
     both = np.isfinite(boards[:, 0, 0]) & np.isfinite(reference[:, 0, 0])
     if not both.any():
-        raise ValueError(f"{device}: expected poses that it sees together with the first device, found none")
+        raise Undetermined(f"{device}: expected poses that it sees together with the first device, found none")
     device_from_world = boards[both] @ np.array([rigid.invert(place) for place in reference[both]])
     found = middle(device_from_world)
     turns = Rotation.from_matrix(device_from_world[:, :3, :3] @ found[:3, :3].T).magnitude()
     strays = int(np.count_nonzero(np.rad2deg(turns) > STRAY_DEG))
     if strays > CONTRADICTING * len(turns):
-        raise ValueError(
+        raise Undetermined(
             f"{device}: expected it to stand still beside the first device, found it turned in {strays} of {len(turns)} poses: "
             f"{causes}?"
         )

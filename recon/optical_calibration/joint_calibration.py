@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from recon import arguments
 from recon.errors import InputError
+from recon.estimation.equations import Undetermined
 from recon.geometry import board_shape, usual_lenses
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import difference
@@ -39,6 +40,10 @@ BAD_POSE = 5.0  # times the noise: median residual of a pose in one device that 
 OUTSIDE_PX = 50.0  # of an image, where points may be found yet: the projector's, carried on
 MANY_POINTS = 400  # of a board: the shape of one with more takes too long to find
 ENOUGH = 2.0  # sightings' coordinates an unknown, the board's points among these, to find its shape by
+UNSOLVED = (
+    "equations without a solution: are poses few or nearly parallel, or is the board another one? "
+    "shape.released=false takes it as designed, which needs less"
+)
 BENT = 0.9  # of a flatness tolerance's variance: bowing, which neighbours share
 
 
@@ -117,14 +122,9 @@ def calibrate(
     try:
         with np.errstate(all="ignore"):  # what isn't finite is refused
             return _calibrate([without_scraps(sighting) for sighting in sightings], board, sizes, settings or Settings(), name)
-    except InputError:
-        raise
     except np.linalg.LinAlgError:
-        raise InputError(
-            f"{name}: expected sightings that determine all devices, found equations without a solution: are poses few or nearly "
-            "parallel, or is the board another one? shape.released=false takes it as designed, which needs less"
-        ) from None
-    except ValueError as error:
+        raise InputError(f"{name}: expected sightings that determine all devices, found {UNSOLVED}") from None
+    except Undetermined as error:
         raise InputError(f"{name}: expected sightings that determine all devices, found {error}") from None
 
 
@@ -195,7 +195,7 @@ def _calibrate(sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, 
     adjusted = adjust(observations, adjusted.estimate, free, offsets, tolerances, released, lenses)
     agreement = consistency(adjusted)
     if not np.isfinite(agreement.covariance).all():
-        raise np.linalg.LinAlgError
+        raise Undetermined(UNSOLVED)
     halves = compare_halves(adjusted, agreement)
     adjusted = with_covariance(adjusted, agreement.covariance)
     found = [*checks.warnings(observations, adjusted), *filter(None, (agreement.warning, size_warning))]
@@ -305,6 +305,7 @@ def _consistent(
     The adjustment, the observations that are left, and what was left out with the reason.
     """
     dropped: dict[str, str] = {}
+    contradicted = Counter[str]()  # poses by device
     total = len(observations.poses)
     while True:
         offsets = circle_offsets(observations, estimate, board)
@@ -314,14 +315,16 @@ def _consistent(
         worst, device = np.unravel_index(int(np.argmax(misfit)), misfit.shape)
         if misfit[worst, device] < BAD_POSE:
             return adjusted, observations, dropped
+        contradicted[observations.devices[device]] += 1
         lengths = np.linalg.norm(adjusted.residuals[worst, :, device], axis=-1)
         dropped[observations.poses[worst]] = (
             f"contradicts the other poses by {np.nanmedian(lengths):.2g} px in {observations.devices[device]}"
         )
         if len(dropped) > initial_estimate.CONTRADICTING * total:
+            ((most, _),) = contradicted.most_common(1)
             raise InputError(
                 f"{name}: expected poses that fit one rig, found {len(dropped)} of {total} that don't, "
-                f"most in {observations.devices[device]}: {initial_estimate.causes(observations.devices[device], light)}?"
+                f"most in {most}: {initial_estimate.causes(most, light)}?"
             )
         rest = np.delete(np.arange(len(observations.poses)), worst)
         observations = observations.of_poses(rest)

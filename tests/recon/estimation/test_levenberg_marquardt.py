@@ -109,6 +109,17 @@ def test_a_minimum_that_rounding_hides_has_converged():
     assert found.converged and (found.estimate == 1).all()
 
 
+@pytest.mark.parametrize("rest", [0.0, 1.0, 100.0])
+def test_slopes_of_the_wrong_sign_have_not_converged(rest):
+    """All steps lead uphill, and the shorter ones by ever less, whether or not the cost at its minimum is much of it."""
+
+    def wrong(p):
+        return Rows(np.array([[-1.0], [0.0]]), np.array([-p[0], rest])), float(p @ p + rest**2)
+
+    found = descend(np.array([3.0]), wrong, np.add)
+    assert not found.converged and found.estimate == 3.0
+
+
 def test_steps_run_out():
     found = descend(np.array([-4.0, 4.0]), linearise, np.add, rules=Rules(steps=2))
     assert found.step is None and not found.converged

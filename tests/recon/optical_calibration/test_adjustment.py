@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from recon.estimation.equations import Step
-from recon.estimation.levenberg_marquardt import Unreachable
+from recon.estimation.equations import Step, Undetermined
+from recon.estimation.levenberg_marquardt import Descent, Unreachable
 from recon.geometry import rigid
 from recon.geometry.board_shape import Tolerances
 from recon.geometry.camera_jacobian import MATRIX
@@ -145,12 +145,26 @@ def test_a_step_to_a_camera_that_can_not_be_is_unreachable(rig, rng):
     assert move(problem, start, Step(step, still)).cameras["projector"].matrix[1, 1] == cameras["projector"].matrix[1, 1] + 10
 
 
+@pytest.mark.parametrize(("measured", "noise", "converged"), [(1.0, 1.0, True), (2.0, 1024.0, False), (0.0, 1e-3, True)])
+def test_the_noise_converges_too(measured, noise, converged, rig, rng, monkeypatch):
+    """Noise that doubles with each round isn't what the last estimate was weighed by; where there is none, it has a floor."""
+    cameras = devices(rig)
+    poses = random_poses(cameras, 2, rng)
+    seen = observe(cameras, poses, rng)
+    problem = Problem(seen, np.zeros_like(seen.pixels), free_parameters(DEVICES, LENS))
+    start = Estimate(cameras, poses, BOARD.points())
+    monkeypatch.setattr(adjustment, "_descend", lambda *_: Descent(start, None, None, True))
+    monkeypatch.setattr(adjustment, "_measured_noise", lambda *_: np.full(3, measured))
+    found = adjustment.fit(problem, start)
+    assert found.converged is converged and found.noise == pytest.approx(noise)
+
+
 def test_too_few_sightings_are_refused(rig, rng):
     cameras = devices(rig)
     poses = random_poses(cameras, 2, rng)
     seen = observe(cameras, poses, rng)
     sparse = replace(seen, pixels=np.where((np.arange(44) % 11 == 0)[:, None, None], seen.pixels, np.nan))
-    with pytest.raises(ValueError, match="fewer observations than unknowns"):
+    with pytest.raises(Undetermined, match="fewer observations than unknowns"):
         adjust(sparse, Estimate(cameras, poses, BOARD.points()), free_parameters(DEVICES, LENS))
 
 

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -96,6 +98,39 @@ def test_poses_that_mostly_contradict_each_other_are_refused(sizes, good):
     shuffled = [replace(one, pixels={**one.pixels, "cam2": good[k].pixels["cam2"]}) for one, k in zip(good, order, strict=True)]
     with pytest.raises(InputError, match=r"stand still beside the first device.*mixed up"):
         joint_calibration.calibrate(shuffled, BOARD, sizes, QUICK)
+
+
+def test_mistakes_of_the_program_are_not_blamed_on_sightings(sizes, good, monkeypatch):
+    def mistaken(*_):
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(joint_calibration.initial_estimate, "estimate", mistaken)
+    with pytest.raises(ValueError, match=r"^operands could not be broadcast") as raised:
+        joint_calibration.calibrate(good, BOARD, sizes)
+    assert not isinstance(raised.value, InputError)
+
+
+def test_the_device_that_most_poses_contradict_is_named(monkeypatch):
+    """Four poses of nine: three contradict in camera 2, by more and more, and the last that is left out in the projector."""
+    misfits = np.ones((9, 1, 3))
+    misfits[:4, 0] = [[1, 90, 1], [1, 80, 1], [1, 70, 1], [1, 1, 60]]
+
+    class Poses(NamedTuple):
+        poses: list[int]
+        devices: tuple[str, ...] = DEVICES
+
+        def of_poses(self, kept):
+            return Poses([self.poses[k] for k in kept])
+
+    def adjusted(observations, *_):
+        normalised, count = misfits[observations.poses], len(observations.poses)
+        values = {"normalised": normalised, "residuals": np.ones((count, 1, 3, 2)), "poses": np.arange(count), "points": None}
+        return SimpleNamespace(calibration=Calibration({}), **values)
+
+    monkeypatch.setattr(joint_calibration, "circle_offsets", lambda *_: None)
+    monkeypatch.setattr(joint_calibration, "adjust", adjusted)
+    with pytest.raises(InputError, match=r"found 4 of 9 that don't, most in cam2: "):
+        joint_calibration._consistent(Poses(list(range(9))), None, {}, BOARD, "board", "")
 
 
 @pytest.mark.parametrize(("device", "named"), [("projector", True), ("cam2", False)])
