@@ -1,5 +1,6 @@
 """Arguments of the public Python functions: of the right kind, shape and range, or refused in one line that names them."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -82,6 +83,18 @@ def whole(name: str, value: Any, least: int, most: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise InputError(f"{name}: expected a whole number from {least} to {most}, found {described(value)}")
     return int(value)
+
+
+def number(name: str, value: Any, least: float = 0.0, most: float = math.inf, above: bool = False) -> float:
+    """A number within limits, not NaN.
+
+    above : the least itself is refused, too
+    """
+    good = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not good or not least <= value <= most or (above and value == least):
+        up_to = "" if most == math.inf else f" to {most:g}"
+        raise InputError(f"{name}: expected a number {'above' if above else 'from'} {least:g}{up_to}, found {described(value)}")
+    return float(value)
 
 
 def image_size(name: str, value: Any, order: str = "width and height") -> tuple[int, int]:

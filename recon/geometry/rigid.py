@@ -13,7 +13,15 @@ FEW_DIGITS = 1e-3  # of a rotation's products, as text files with few digits hav
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Build a 4x4 transform from a (3, 3) rotation matrix and a (3,) translation in mm."""
+    """Build a 4x4 transform from a (3, 3) rotation matrix and a (3,) translation in mm.
+
+    Raises
+    ------
+    ValueError
+        If their shapes are others; a translation may be a column or a row.
+    """
+    if np.shape(rotation) != (3, 3) or np.size(translation) != 3:
+        raise ValueError(f"expected a 3x3 rotation and 3 translations, found {np.shape(rotation)} and {np.shape(translation)}")
     result = np.eye(4)
     result[:3, :3] = rotation
     result[:3, 3] = np.asarray(translation, float).ravel()
@@ -65,8 +73,9 @@ def _row(values: Array) -> str:
 
 
 def nearest(pose: Array) -> Array:
-    """The rigid transform whose rotation is the nearest to that of a pose : (4, 4) with few digits."""
+    """The rigid transform whose rotation is the nearest to that of a pose : (4, 4) with few digits, be that mirrored."""
     left, _, right = np.linalg.svd(pose[:3, :3])
+    left[:, 2] *= np.sign(np.linalg.det(left @ right))  # the axis that matters least, as Kabsch has it
     return transform(left @ right, pose[:3, 3])
 
 

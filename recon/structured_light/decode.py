@@ -150,7 +150,9 @@ def decode(
         found = f"{images.shape[2]}x{images.shape[1]}"
         raise InputError(f"{name}: expected images of {SMALLEST}x{SMALLEST} px or more, found {found}")
     full = 2.0**bits - 1
-    least = DARKEST * full / 255 if min_modulation_dn is None else min_modulation_dn
+    least = DARKEST * full / 255
+    if min_modulation_dn is not None:
+        least = arguments.number(f"{name}: min_modulation_dn", min_modulation_dn, most=full)
     parts = patterns.slices()
     errors = {
         place.start: frame_errors.estimate(images[place], part.shifts, least_modulation=least, saturation=full)
@@ -173,9 +175,23 @@ def decode(
     columns, rows = (axes[axis].coordinates[:2] if axis in axes else (None, None) for axis in ("columns", "rows"))
     pixels = cv2.calcHist([status], [0], None, [len(Status)], [0, len(Status)]).astype(int).ravel().tolist()
     summary = {s.name.lower(): pixels[s] for s in Status} | dict(counts)
-    shown = (first.modulation, first.offset, first.phase, status, lit)
-    taken = noise, summary, source, linearity, camera, patterns.projector_size
-    return ProjectorMap(columns[0], rows[0], columns[1], rows[1], *shown, *taken)
+    return ProjectorMap(
+        columns=columns[0],
+        rows=rows[0],
+        sigma_columns=columns[1],
+        sigma_rows=rows[1],
+        modulation=first.modulation,
+        offset=first.offset,
+        phase=first.phase,
+        status=status,
+        lit=lit,
+        noise=noise,
+        summary=summary,
+        noise_source=source,
+        linearity=linearity,
+        camera=camera,
+        projector_size=patterns.projector_size,
+    )
 
 
 def _from_fringes(shots: Shots, axis: Axis) -> _AxisMap:
@@ -198,8 +214,15 @@ def _from_fringes(shots: Shots, axis: Axis) -> _AxisMap:
     orders, unreachable, counts = shots.patterns.unwrapping.orders(shots, axis, sets, status == Status.OK, light)
     scale = Scale(float(part.zero(length)), part.pitch, length)
     x, sigma = _coordinates(fringe, orders, unreachable, status, scale)
-    shown = (fringe.modulation, fringe.offset, fringe.phase)
-    return _AxisMap(Coordinates(x, sigma, status), *shown, lit, counts, linearity)
+    return _AxisMap(
+        coordinates=Coordinates(x, sigma, status),
+        modulation=fringe.modulation,
+        offset=fringe.offset,
+        phase=fringe.phase,
+        lit=lit,
+        counts=counts,
+        linearity=linearity,
+    )
 
 
 def _from_code(shots: Shots, axis: Axis) -> _AxisMap:
@@ -221,7 +244,9 @@ def _from_code(shots: Shots, axis: Axis) -> _AxisMap:
     unknown, nothing = status != OK, np.float32(np.nan)
     x, sigma = np.where(unknown, nothing, cells.middle), np.where(unknown, nothing, cells.sigma)
     lit = modulation * LIT_SIGMA > np.sqrt(noise.read_variance + noise.gain * offset)
-    return _AxisMap(Coordinates(x, sigma, status), modulation, offset, np.full_like(x, nothing), lit, {})
+    phase = np.full_like(x, nothing)
+    coordinates = Coordinates(x, sigma, status)
+    return _AxisMap(coordinates=coordinates, modulation=modulation, offset=offset, phase=phase, lit=lit, counts={})
 
 
 def _noise(

@@ -32,7 +32,13 @@ NOISE = 6.0  # standard deviations that the difference of two points has at most
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the surface. A *sampling step* is the width of a pixel at the point: distance / focal length."""
+    """Limits of the surface. A *sampling step* is the width of a pixel at the point: distance / focal length.
+
+    Raises
+    ------
+    InputError
+        If one is out of its own limits.
+    """
 
     max_slope: Positive = 12.0  # sampling steps along the ray a pixel; 12 is a surface seen at 85 deg from its normal
     max_bend: Positive = 3.0  # of a step, over its neighbours': beyond, and longer than the next, it is torn
@@ -41,6 +47,12 @@ class Limits:
     outlier_steps: Positive = 1.0  # distance from the local plane, in sampling steps, beyond the noise
     min_modulation: Fraction = 0.5  # at an edge: fringe modulation, as a fraction of the strongest within two pixels
     min_island_px: Annotated[int, Field(ge=1)] = 400  # smaller connected pieces are left out
+
+    def __post_init__(self) -> None:
+        for name in ("max_slope", "max_bend", "min_tear", "max_sigma", "outlier_steps"):
+            arguments.number(name, getattr(self, name), above=True)
+        arguments.number("min_modulation", self.min_modulation, most=1)
+        arguments.whole("min_island_px", self.min_island_px, 1, 10**10)
 
 
 class Tears(NamedTuple):
@@ -109,6 +121,7 @@ def mesh(
         as `vertex_attributes["sigma_mm"]`.
     """
     _check("mesh_surface", point_map, camera, {"grey": grey})
+    arguments.number("mesh_surface: max_slope", max_slope, above=True)
     distance, step = _distances(point_map.points, camera)
     faces = _triangles(distance, max_slope * step + _difference(point_map.sigma))
     used = np.zeros(distance.size, bool)

@@ -97,11 +97,9 @@ def triangulate(projector_map: ProjectorMap, camera: Camera, projector: Camera, 
 
     Raises
     ------
-    ValueError
-        If a coordinate or a sigma has another size than the camera.
     InputError
-        If the images were taken by another camera, or the patterns have another size than the projector; if columns and rows
-        contradict each other by these devices.
+        If a coordinate or a sigma has another size than the camera; if the images were taken by another camera, or the patterns
+        have another size than the projector; if columns and rows contradict each other by these devices.
     """
     return Triangulator(camera, projector)(projector_map, implausible)
 
@@ -143,7 +141,8 @@ def _axis(name: str, coordinate: NDArray | None, sigma: NDArray | None, shape: t
         sigma = np.full(shape, np.nan, np.float32)
     for part, found in ((name, coordinate.shape), (f"sigma_{name}", sigma.shape)):
         if found != shape:
-            raise ValueError(f"projector map: {part}: expected an image of shape {shape}, found {found}")
+            expected = f"expected an image of shape {shape}, as the camera's"
+            raise InputError(f"triangulate: projector_map.{part}: {expected}, found {found}: another camera's?")
     return coordinate, sigma
 
 

@@ -1,6 +1,7 @@
 """Rigid transforms keep what rigid motion keeps."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -83,6 +84,22 @@ def test_the_nearest_rotation_is_no_farther_than_the_one_that_was_rounded(pose):
     found = rigid.nearest(rounded)
     assert rigid.fault(found, CLOSE) is None and np.array_equal(found[:3, 3], rounded[:3, 3])
     assert np.linalg.norm(found[:3, :3] - rounded[:3, :3]) <= np.linalg.norm(pose[:3, :3] - rounded[:3, :3]) + CLOSE
+
+
+@given(poses)
+def test_the_nearest_transform_of_a_mirrored_frame_is_no_mirror(pose):
+    """Whatever the axis: what is nearest is still rigid."""
+    for axis in range(3):
+        mirrored = pose.copy()
+        mirrored[:3, axis] *= -1
+        assert rigid.fault(rigid.nearest(mirrored), CLOSE) is None
+
+
+@pytest.mark.parametrize(("rotation", "translation"), [(np.eye(3), 5.0), (1.0, [1, 2, 3]), ([1, 0, 0], [1, 2, 3])])
+def test_shapes_are_not_filled_up(rotation, translation):
+    """A shift that is one number isn't that along all three axes."""
+    with pytest.raises(ValueError, match="expected a 3x3 rotation and 3 translations, found"):
+        rigid.transform(rotation, translation)
 
 
 @given(poses, angles, lengths)

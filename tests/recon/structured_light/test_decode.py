@@ -368,3 +368,12 @@ def test_bright_objects_on_something_dark_are_no_uneven_steps(rng, steps, object
         twice[2] = twice[1]
         with pytest.raises(InputError, match=f"do not follow the {part.steps}-step sequence"):
             plausibility.check_fringes(twice, part, fringe, 4.0, 255.0, "images", place.start)
+
+
+@pytest.mark.parametrize("least", [np.nan, -1.0, 256.0])
+def test_a_least_modulation_that_is_none_is_refused(least):
+    """No pixel is below one that is not a number: dark ones would all have coordinates."""
+    patterns = load("paper_surface")
+    images = np.zeros((patterns.count, 16, 16), np.uint8)
+    with pytest.raises(InputError, match=r"^images: min_modulation_dn: expected a number from 0 to 255, found"):
+        decode(images, patterns, min_modulation_dn=least)

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.ndimage import binary_dilation, gaussian_filter
 
+from recon.errors import InputError
 from recon.files import meshes
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
@@ -178,6 +179,26 @@ def test_a_full_grid_has_two_triangles_a_square():
     assert len(mesh.faces) == 2 * 39 * 29 - 4, (
         "each of the four squares about a missing point keeps the triangle that can do without"
     )
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [{"max_sigma": -1.0}, {"max_slope": np.nan}, {"min_modulation": 1.1}, {"min_island_px": 0}, {"min_tear": 0.0}],
+    ids=str,
+)
+def test_limits_that_nothing_or_all_would_pass_are_refused(limits):
+    (name,) = limits
+    with pytest.raises(InputError, match=f"^{name}: expected a (whole )?number "):
+        surface_mesh.Limits(**limits)
+
+
+def test_a_slope_that_is_no_number_is_refused():
+    """A comparison with it would tear every edge, and leave an empty mesh."""
+    camera = Camera((8, 8), np.array([[100.0, 0, 4], [0, 100, 4], [0, 0, 1]]), np.zeros(0))
+    flat = PointMap(np.float32(500 * camera.rays(camera.pixel_grid())), np.full((8, 8), 0.01, np.float32))
+    assert len(surface_mesh.mesh(flat, camera, np.inf).faces) == 2 * 7 * 7
+    with pytest.raises(InputError, match=r"^mesh_surface: max_slope: expected a number above 0, found nan$"):
+        surface_mesh.mesh(flat, camera, np.nan)
 
 
 def test_files_hold_the_mesh(scene, tmp_path):
