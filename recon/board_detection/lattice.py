@@ -46,7 +46,11 @@ def assign(points: Array, cells: Integers, steps: Integers) -> Integers:
     count = 0
     most_mirrored = 0
     grids: list[dict[tuple[int, int], int]] = []
+    seen: set[bytes] = set()
     for grown in _grown_grids(points, steps):
+        if (form := _form(grown)) in seen:  # most seeds grow into the same grid, turned or shifted: placements would be the same
+            continue
+        seen.add(form)
         grids.append(grown)
         for assignment in _placements(grown, cells, TURNS):
             found = int((assignment >= 0).sum())
@@ -136,6 +140,14 @@ def _grow(points: Array, seed: int, a: Array, b: Array, steps: Integers) -> dict
                 local[goal][axis] = sign * (points[nearest] - points[cells[cell]])
                 queue.append(goal)
     return cells
+
+
+def _form(grown: dict[tuple[int, int], int]) -> bytes:
+    """The same of all grids that differ by a turn and a shift of their cells alone."""
+    places, numbers = np.array(list(grown)), np.array(list(grown.values()))
+    order = np.argsort(numbers)
+    turned = [places[order] @ turn.T for turn in TURNS]
+    return numbers[order].tobytes() + min((cells - cells.min(axis=0)).tobytes() for cells in turned)
 
 
 def _placements(grown: dict[tuple[int, int], int], cells: Integers, turns: list[Integers]) -> list[Integers]:
