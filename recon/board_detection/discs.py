@@ -43,7 +43,7 @@ def candidates(image: Array, full: float = 255) -> Ellipses:
         block = max(min(grey.shape) // part, 5) | 1
         dark = cv2.adaptiveThreshold(grey, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, THRESHOLD)
         contours = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        found += [ellipse for contour in contours if (ellipse := _ellipse(contour.reshape(-1, 2), grey)) is not None]
+        found += _elliptical([contour.reshape(-1, 2) for contour in contours], grey)
     return _distinct(found)
 
 
@@ -81,28 +81,35 @@ def _stretched(image: Array, full: float) -> NDArray[np.uint8]:
     return cv2.GaussianBlur(np.clip(scaled, 0, 255).astype(np.uint8), (3, 3), 0)
 
 
-def _ellipse(contour: Array, grey: NDArray[np.uint8]) -> tuple[float, Array, Array] | None:
-    """Deviation from an ellipse, centre and shape of a closed contour; None if it's no ellipse or touches the border."""
-    if len(contour) < 12:
-        return None
-    low, high = contour.min(axis=0), contour.max(axis=0)
-    if low.min() <= 1 or high[0] >= grey.shape[1] - 2 or high[1] >= grey.shape[0] - 2:
-        return None
-    moments = cv2.moments(contour.reshape(-1, 1, 2).astype(np.int32))
-    area = moments["m00"]
-    if area < LEAST_AREA:
-        return None
-    centre = np.array([moments["m10"], moments["m01"]]) / area
-    second = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
-    shape = root(4 * second[None])[0]
-    axes = np.linalg.eigvalsh(shape)
-    if axes[0] < LEAST_RATIO * axes[1]:
-        return None
-    v = (contour - centre) @ np.linalg.inv(shape)
-    deviation = np.sqrt(np.mean((np.hypot(v[:, 0], v[:, 1]) - 1) ** 2))
-    if deviation > ROUNDNESS + 0.3 / axes[0]:
-        return None
-    return float(deviation), centre, shape + 0.5 * np.eye(2)  # the contour runs through the outermost pixels' middles
+def _elliptical(contours: list[Array], grey: NDArray[np.uint8]) -> list[tuple[float, Array, Array]]:
+    """Deviation from an ellipse, centre and shape of each of the closed contours that is one and doesn't touch the border."""
+    whole, areas, centres, seconds = [], [], [], []
+    for contour in contours:
+        if len(contour) < 12:
+            continue
+        left, top, width, height = cv2.boundingRect(contour)
+        if min(left, top) <= 1 or left + width > grey.shape[1] - 2 or top + height > grey.shape[0] - 2:
+            continue
+        moments = cv2.moments(contour)
+        if moments["m00"] < LEAST_AREA:
+            continue
+        whole.append(contour)
+        areas.append(moments["m00"])
+        centres.append([moments["m10"], moments["m01"]])
+        seconds.append([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]])
+    if not whole:
+        return []
+    area = np.array(areas)
+    centre, second = np.array(centres) / area[:, None], np.array(seconds) / area[:, None, None]
+    shape = root(4 * second)
+    axes, inverse = np.linalg.eigvalsh(shape), np.linalg.inv(shape)
+    found = []
+    for k in np.flatnonzero(axes[:, 0] >= LEAST_RATIO * axes[:, 1]):
+        v = (whole[k] - centre[k]) @ inverse[k]
+        deviation = np.sqrt(np.mean((np.hypot(v[:, 0], v[:, 1]) - 1) ** 2))
+        if deviation <= ROUNDNESS + 0.3 / axes[k, 0]:  # the contour runs through the outermost pixels' middles
+            found.append((float(deviation), centre[k], shape[k] + 0.5 * np.eye(2)))
+    return found
 
 
 def _distinct(found: list[tuple[float, Array, Array]]) -> Ellipses:

@@ -169,5 +169,8 @@ def _moved(ellipses: Ellipses, step: Array) -> Ellipses:
 
 def _tukey(z: Array, finite: NDArray[np.bool_]) -> Array:
     """Tukey's weights for absolute residuals over sigma; the scale is 1, or that of the residuals where they scatter more."""
-    typical = np.nanmedian(np.where(finite | ~finite.any(axis=1, keepdims=True), z, np.nan), axis=1)
+    z_sorted = np.sort(np.where(finite | ~finite.any(axis=1, keepdims=True), z, np.nan), axis=1)  # NaN last
+    count = (~np.isnan(z_sorted)).sum(axis=1)
+    middle = np.maximum([(count - 1) // 2, count // 2], 0).T
+    typical = np.take_along_axis(z_sorted, middle, axis=1).mean(axis=1)  # `numpy.nanmedian` takes ten times as long
     return np.clip(1 - (z / (TUKEY * np.maximum(1, NORMAL_MAD * typical)[:, None])) ** 2, 0, 1) ** 2
