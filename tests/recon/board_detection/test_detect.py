@@ -128,8 +128,9 @@ def test_another_layout_is_named_with_the_field_that_takes_it(board, given, hint
         detect(image, board.model_copy(update=given))
 
 
-def test_tags_under_a_wide_lens_are_on_their_grid(rng):
+def test_tags_under_a_wide_lens_are_on_their_grid(rng, monkeypatch):
     """Of a lens with k1 of -0.35, 10 x 7 tags lie 0.26 tags off any map without distortion."""
+    monkeypatch.setattr(board_views, "SUB", 2)  # quick, and fine enough to be found
     board = AprilGrid(columns=10, rows=7, tag_mm=50)
     camera = Camera((752, 480), np.array([[458, 0, 367], [0, 457, 248], [0, 0, 1.0]]), np.array([-0.35, 0.12, 0, 0, 0]))
     found = detect(noisy(view(board, camera, pose(board, 400, (0, 0), 0.0)), rng), board)
@@ -206,10 +207,9 @@ def test_large_squares_are_found(board, rng, monkeypatch):
     """Full images; squares of some 75 px, as boards that fill the image have."""
     monkeypatch.setattr(board_views, "SUB", 1)  # quick, and fine enough to be found
     camera = Camera((1280, 1024), np.array([[1800, 0, 640], [0, 1800, 512], [0, 0, 1.0]]), np.array([-0.1, 0.1, 0, 0]))
-    for _ in range(4):
-        at = pose(board, rng.uniform(1400, 1600), rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2), rng.uniform(-30, 30, 2))
-        found = detect(view(board, camera, at, noise=1.0, rng=rng), board)
-        assert np.abs(found.pixels - camera.project(rigid.apply(at, board.points()))).max() < 0.5
+    at = pose(board, rng.uniform(1400, 1600), rng.uniform(-0.5, 0.5, 2), rng.uniform(-0.2, 0.2), rng.uniform(-30, 30, 2))
+    found = detect(view(board, camera, at, noise=1.0, rng=rng), board)
+    assert np.abs(found.pixels - camera.project(rigid.apply(at, board.points()))).max() < 0.5
 
 
 def test_a_chessboard_in_part_is_not_called_a_board_of_another_size(clean, rng):
