@@ -75,15 +75,15 @@ def test_five_calibrations_agree_and_are_right(rig, probe, rng, roll_deg):
 
 
 def test_the_covariance_is_honest(probe, frames, rng):
-    """Errors of 15 calibrations, normalised by their covariance, are chi-square with 8 degrees of freedom each."""
+    """Errors of 8 calibrations, normalised by their covariance, are chi-square with 8 degrees of freedom each."""
     total = 0.0
-    for _ in range(15):
+    for _ in range(8):
         made = calibrate(observe(probe, *frames, rng), SIZE, NOISE).calibration
         turn = Rotation.from_matrix(probe.target_from_image[:3, :3] @ made.target_from_image[:3, :3].T).as_rotvec()
         shift = probe.target_from_image[:3, 3] - made.target_from_image[:3, 3]
         error = np.concatenate([probe.scale - made.scale, turn, shift])
         total += error @ np.linalg.solve(made.uncertainty.covariance, error)
-    low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 15)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 8 * 8)
     assert low < total < high * 79 / 77  # the noise level itself is measured, from 79 degrees of freedom
 
 
@@ -150,11 +150,11 @@ def test_outliers_that_agree_with_each_other_are_still_outliers(probe, frames, r
     assert errors(result.calibration, probe).max() < 0.45
 
 
-@pytest.mark.parametrize("count", [8, 11, 15])
+@pytest.mark.parametrize("count", [8, 15])
 def test_few_good_frames_are_not_taken_for_outliers_of_each_other(probe, frames, count):
     """Twelve unknowns fit six frames by themselves: their residuals are small, and others' would look large beside them."""
     kept = []
-    for seed in range(10):
+    for seed in range(6):
         rng = np.random.default_rng([seed, count])
         some = rng.choice(len(frames[1]), count, replace=False)
         adjusted = calibrate(observe(probe, frames[0][some], frames[1][some], rng), SIZE, NOISE, max_sigma_mm=100)
@@ -294,7 +294,7 @@ def shifts(poses, matrix):
     ],
 )
 def test_poses_that_mean_something_else_are_named(probe, frames, rng, wrong, named):
-    sightings = observe(probe, *frames, rng)
+    sightings = observe(probe, *(part[::2] for part in frames), rng)
     with pytest.raises(InputError, match=named) as raised:
         calibrate(Sightings(wrong(sightings.poses), sightings.pixels), SIZE, NOISE)
     assert "\n" not in str(raised.value)

@@ -12,7 +12,7 @@ from recon.model.calibration import Uncertainty
 from recon.target_calibration import target_bundle
 from tests.recon.target_calibration import target_pairs
 
-DRAWS = 20
+DRAWS = 12
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_errors_are_as_large_as_predicted(cameras, rig, rng):
     squared, curved = [], []
     for _ in range(DRAWS):
         actual = target_pairs.printed(rig.target, rng)
-        found = target_bundle.adjust(target_pairs.many(cameras, actual, 10, rng), rig.target, None)
+        found = target_bundle.adjust(target_pairs.many(cameras, actual, 6, rng), rig.target, None)
         off = numbers(found.target) - numbers(actual)
         squared.append(off[:3] @ np.linalg.solve(found.covariance[:3, :3], off[:3]))
         curved.append(off[4:] @ np.linalg.solve(found.covariance[4:, 4:], off[4:]))
@@ -46,7 +46,7 @@ def test_errors_of_the_cameras_are_in_the_covariance(cameras, rig, rng):
     for _ in range(DRAWS // 2):
         real = camera_jacobian.moved(cameras[1], names, sigma * rng.standard_normal(3))
         actual = target_pairs.printed(rig.target, rng)
-        pairs = target_pairs.many(cameras, actual, 10, rng, (cameras[0], real))
+        pairs = target_pairs.many(cameras, actual, 6, rng, (cameras[0], real))
         for known, results in ((optics, squared), (None, blind)):
             found = target_bundle.adjust(pairs, rig.target, known)
             off = numbers(found.target)[:3] - numbers(actual)[:3]

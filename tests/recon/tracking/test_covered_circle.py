@@ -45,7 +45,7 @@ def followed(cameras, target, place, frames):
 def test_the_third_place_follows_from_two_discs(cameras, rig, rng, which):
     """As far as a view is affine: perspective across the target is the rest."""
     away = []
-    for _ in range(40):
+    for _ in range(20):
         true = drawings.shown(cameras[0], drawings.facing(rng), rig.target)
         told = covered_circle.further(true, np.arange(3) != which, which, rig.target)
         away.append(np.linalg.norm(told.centre[0] - true.centre[which]))
@@ -93,7 +93,7 @@ def halved(image, ellipse, level, rng):
 def test_a_known_shape_steadies_a_rim_of_which_half_is_covered(cameras, rig, rng):
     """In the dark, with shapes that are off by 0.3 % and known to be: centres are more exact, and as exact as they say."""
     errors, squared = {0.003: [], np.inf: []}, []
-    for _ in range(24):
+    for _ in range(14):
         place = drawings.facing(rng, 25.0)
         one = drawings.shown(cameras[0], place, rig.target)[[1]]
         image = halved(drawings.frame(cameras[0], [place], rig.target, 6.0, rng), one, 3.5, rng)
@@ -114,7 +114,7 @@ def test_shapes_of_the_others_are_not_trusted_too_far(cameras, rig, rng, monkeyp
     """Perspective takes them from the covered one's: trusted to 3.5 %, more rims are found, and as exactly; to 1 % it would bend
     them."""
     errors = {covered_circle.SHAPE: [], 1e6: []}
-    for _ in range(24):
+    for _ in range(12):
         place = drawings.facing(rng, 25.0)
         true = drawings.shown(cameras[0], place, rig.target)
         image = halved(drawings.frame(cameras[0], [place], rig.target, 6.0, rng), true[[1]], 3.5, rng)
@@ -125,14 +125,14 @@ def test_shapes_of_the_others_are_not_trusted_too_far(cameras, rig, rng, monkeyp
             again = covered_circle.completed(image, seen, rig.target)
             off.append(np.linalg.norm(again.ellipses.centre[1] - true.centre[1]) if again.found[1] else np.nan)
     trusted, free = (np.array(off) for off in errors.values())
-    assert np.isfinite(trusted).sum() >= max(np.isfinite(free).sum(), 23)
+    assert np.isfinite(trusted).sum() >= max(np.isfinite(free).sum(), 11)
     assert np.nanmedian(trusted) < 1.3 * np.nanmedian(free)
 
 
 def test_one_camera_is_enough_for_half_a_rim_if_it_is_exact(cameras, rig, rng):
     """What looks like a rim may be the edge of what covers it: one camera's ellipses must be those that a pose gives them."""
     found, off = [], []
-    for _ in range(12):
+    for _ in range(8):
         place = drawings.facing(rng, 25.0)
         true = drawings.shown(cameras[0], place, rig.target)
         image = halved(drawings.frame(cameras[0], [place], rig.target, 80.0, rng), true[[1]], 45, rng)
@@ -161,7 +161,7 @@ def test_a_rim_that_is_covered_must_have_the_shape_of_a_pose(cameras, rig, rng, 
 @pytest.mark.parametrize("level", [15, 37])
 def test_a_fingertip_near_a_rings_place_is_not_taken_for_it(cameras, rig, rng, level):
     """As large as a disc and a millimetre from where c2 should be: skin isn't ink, and one as dark as ink is off."""
-    for _ in range(3):
+    for _ in range(2):
         place, angle, frames = drawings.facing(rng, 25.0), rng.uniform(0, 2 * np.pi), []
         aside = rigid.transform(np.eye(3), np.array([np.cos(angle), np.sin(angle), 0]))
         for camera in cameras:
@@ -223,7 +223,7 @@ def test_rims_that_are_bent_in_both_views_are_found_again(cameras, rig, rng, mon
     A rim bent by the edge beside it isn't always noticed: of 16 poses in three draws 6 were 8 to 10 standard deviations off.
     """
     second_look, squared, missed = covered_circle.sought_again, [], 0
-    for _ in range(12):
+    for _ in range(6):
         place, which = drawings.facing(rng, 25.0), rng.integers(3)
         ones = [drawings.shown(camera, place, rig.target)[[which]] for camera in cameras]
         clear = [drawings.frame(camera, [place], rig.target, 80.0, rng) for camera in cameras]
@@ -237,7 +237,7 @@ def test_rims_that_are_bent_in_both_views_are_found_again(cameras, rig, rng, mon
         if found.found:
             error = rigid.difference(place, found.world_from_target)
             squared.append(error @ np.linalg.solve(found.total, error))
-    assert missed >= 4 and len(squared) >= 0.7 * missed
+    assert missed >= 2 and len(squared) >= 0.7 * missed
     assert np.mean(np.array(squared) < chi2.ppf(0.9999, 6)) >= 0.5 and max(squared) < 150
 
 
@@ -257,7 +257,7 @@ def test_the_target_is_not_half_a_turn_away(cameras, rig, rng):
 @pytest.mark.parametrize("unseen", [0, 1, 2])
 def test_two_discs_tell_their_names_by_their_distance(cameras, rig, rng, unseen):
     """25 mm or 40 mm: under other names they are renamed, under their own they keep them."""
-    for _ in range(5):
+    for _ in range(3):
         place = drawings.facing(rng, 15.0)
         frame = drawings.frame(cameras[0], [place], rig.target, 80.0, rng)
         seen = rims.measure(frame, drawings.shown(cameras[0], place, rig.target), 3.0, rig.target).without([unseen])
@@ -270,7 +270,7 @@ def test_two_discs_tell_their_names_by_their_distance(cameras, rig, rng, unseen)
 @pytest.mark.parametrize("which", [[0, 0], [1, 1], [2, 2], [0, 1], [2, 1]])
 def test_the_third_place_follows_from_two_circles_of_each_view(cameras, rig, rng, which):
     """Under one naming, to a pixel; half a turn away there is another pose where it is the same circle that is missing."""
-    for _ in range(5):
+    for _ in range(2):
         place, halves = drawings.facing(rng, 25.0), []
         for camera, k in zip(cameras, which, strict=True):
             frame = drawings.frame(camera, [place], rig.target, 80.0, rng)
@@ -294,7 +294,7 @@ def test_a_circle_that_is_covered_in_both_views_is_found_by_a_second_look(camera
         for camera in cameras:
             one = drawings.shown(camera, place, rig.target)[[which]]
             frames.append(hidden(drawings.frame(camera, [place], rig.target, 80.0, rng), one))
-        return place, followed(cameras, rig.target, place, frames)
+        return place, frames
 
     def in_part(image, one):
         radius, angle = np.sqrt(np.linalg.det(one.shape[0])), rng.uniform(0, 2 * np.pi)
@@ -309,12 +309,13 @@ def test_a_circle_that_is_covered_in_both_views_is_found_by_a_second_look(camera
         v, u = np.ogrid[: image.shape[0], : image.shape[1]]
         return painted(image, np.hypot(u - one.centre[0, 0], v - one.centre[0, 1]) < 1.6 * radius, 45, rng)
 
-    seen = [covered(in_part) for _ in range(6)]
-    found = [(place, result.pose) for place, result in seen if result.found]
-    assert len(found) >= 4
+    seen = [covered(in_part) for _ in range(4)]
+    results = [(place, followed(cameras, rig.target, place, frames)) for place, frames in seen]
+    found = [(place, result.pose) for place, result in results if result.found]
+    assert len(found) >= 3
     for place, each in found:
         error = rigid.difference(place, each.world_from_target)
         assert error @ np.linalg.solve(each.total, error) < chi2.ppf(0.9999, 6)
-    assert not any(covered(wholly)[1].found for _ in range(3))
+    assert not any(followed(cameras, rig.target, *covered(wholly)).found for _ in range(2))
     monkeypatch.setattr(covered_circle, "sought_again", lambda *_: ())
-    assert sum(covered(in_part)[1].found for _ in range(6)) < 4
+    assert sum(followed(cameras, rig.target, place, frames).found for place, frames in seen) < len(found)
