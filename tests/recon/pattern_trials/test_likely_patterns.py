@@ -14,7 +14,7 @@ from recon.pattern_trials import likely_patterns
 from tests.recon.board_views import pose, under_patterns
 
 BOARD = Chessboard(columns=5, rows=4, square_mm=28)
-CAMERA = Camera((320, 256), np.array([[830.0, 0, 158], [0, 832, 127], [0, 0, 1]]), np.zeros(4))
+CAMERA = Camera((192, 154), np.array([[498.0, 0, 95], [0, 499, 76], [0, 0, 1]]), np.zeros(4))
 PROJECTOR = Camera(
     (256, 160),
     np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]),
