@@ -9,7 +9,7 @@ from recon.structured_light.decode import Status, decode
 from recon.structured_light.phase import Noise
 from tests.recon.fringe_scenes import photograph
 
-PROJECTORS = [(1024, 768), (912, 1140), (1920, 1080), (1280, 800)]
+PROJECTORS = [(912, 1140), (1920, 1080)]
 AXES = ("columns", "rows")
 
 
@@ -78,7 +78,7 @@ def test_the_whole_projector_decodes(rng, name, size):
     check(found, maps, 0.85 if name == "gray_pairs" else 0.98)
 
 
-@pytest.mark.parametrize("shape", [(480, 640), (2048, 2448), (211, 1031)], ids="{0[1]}x{0[0]}".format)
+@pytest.mark.parametrize("shape", [(1024, 1224), (211, 1031)], ids="{0[1]}x{0[0]}".format)
 def test_any_camera_size(rng, shape):
     """Other cameras, twelve bits: the same light in finer steps. Only a crop of a large image's rows carries light."""
     patterns = sequence("cue", (1024, 768))
