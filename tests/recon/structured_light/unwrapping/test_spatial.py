@@ -40,11 +40,10 @@ def flood(phase, valid, line_pixels, turns):
     return absolute
 
 
-@pytest.mark.parametrize("gamma", [1.0, 2.2])
-def test_a_smooth_surface_is_covered(rng, patterns, gamma):
-    """A dome with a shadow: no wrong order, and more than 99 % of the lit pixels."""
+def test_a_smooth_surface_is_covered(rng, patterns):
+    """A dome with a shadow, through a gamma: no wrong order, and more than 99 % of the lit pixels."""
     x = breast((512, 640))
-    found = decode(photograph(patterns, {"columns": x}, rng, gamma=gamma), patterns)
+    found = decode(photograph(patterns, {"columns": x}, rng, gamma=2.2), patterns)
     assert not wrong(found, x).any()
     assert np.mean(found.status[np.isfinite(x)] == Status.OK) > 0.99
     assert (found.status[np.isnan(x)] == Status.DARK).all()
@@ -62,7 +61,7 @@ def test_agrees_with_a_flood_fill(rng, patterns):
     assert found.columns[ok] == pytest.approx(slow[ok], abs=1e-3)
 
 
-@pytest.mark.parametrize("block", range(5))
+@pytest.mark.parametrize("block", range(2))
 def test_an_island_is_never_given_a_wrong_order(patterns, block):
     """An object beside the line, touching the background across a jump that passes whole periods: not one wrong pixel.
 
