@@ -21,7 +21,7 @@ from recon.optical_calibration.distortion_selection import MODELS
 from recon.optical_calibration.joint_calibration import deviation
 from tests.recon.board_sets import BOARD, DEVICES, devices, observe, random_poses
 
-SETS = 8
+SETS = 4
 LENS = dict.fromkeys(DEVICES, ("k1", "k2", "p1", "p2"))
 
 
@@ -65,7 +65,7 @@ def test_without_noise_the_truth_is_found(rig, rng):
     assert np.abs(found.residuals).max() < 1e-6
 
 
-@pytest.mark.parametrize("claimed", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("claimed", [0.5, 3.0])
 def test_the_covariance_is_honest_whatever_noise_was_claimed(rig, rng, claimed):
     """Normalised estimation error squared over the sets against chi-square (99.9 %), and the noise as it is."""
     cameras = devices(rig)
@@ -225,7 +225,7 @@ def test_a_bow_of_the_stated_size_stays_within_the_covariance(rig, rng, bend):
     x, y = ((points - points.mean(axis=0)) / (np.ptp(points, axis=0) / 2 + 1e-9)).T[:2]
     bow = y**2 - np.mean(y**2) if bend == "cylinder" else x**2 - y**2
     bent = points + np.column_stack([0 * x, 0 * x, 0.1 * bow / bow.std()])
-    for _ in range(3):
+    for _ in range(2):
         poses = random_poses(cameras, 12, rng)
         seen = observe(cameras, poses, rng, points=bent)
         start, free = Estimate(cameras, poses, points), free_parameters(DEVICES, LENS)

@@ -115,14 +115,14 @@ def test_poses_left_out_are_told_from_single_sightings(result):
 
 
 def test_errors_are_as_large_as_predicted(cameras, rng):
-    """Twelve calibrations against the truth: parameters, and shapes measured with them.
+    """Six calibrations against the truth: parameters, and shapes measured with them.
 
     The normalised error's square is chi square over its degrees of freedom: 36 a calibration. Errors of shape are fewer numbers,
     some eight a calibration, as all points share them.
     """
     truth, volume = Calibration(cameras), None
     squares, shapes, positions = [], [], []
-    for _ in range(12):
+    for _ in range(6):
         found = adjusted(cameras, rng)
         volume = uncertainty.working_volume(found, DEPTHS) if volume is None else volume
         errors = figures_of_merit.errors(found, truth, volume)
@@ -136,9 +136,9 @@ def test_errors_are_as_large_as_predicted(cameras, rng):
         ]
         shapes.append(errors["shape_error_rms_mm"] ** 2 / traces[0])
         positions.append(errors["point_error_rms_mm"] ** 2 / traces[1])
-    assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / (12 * 36)))
-    assert np.mean(shapes) == pytest.approx(1, abs=4 * np.sqrt(2 / (12 * 8)))
-    assert np.mean(positions) == pytest.approx(1, abs=4 * np.sqrt(2 / (12 * 3)))
+    assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / (6 * 36)))
+    assert np.mean(shapes) == pytest.approx(1, abs=4 * np.sqrt(2 / (6 * 8)))
+    assert np.mean(positions) == pytest.approx(1, abs=4 * np.sqrt(2 / (6 * 3)))
 
 
 def test_errors_are_of_the_size_put_in(cameras):

@@ -69,10 +69,9 @@ def photograph(image, rng):
     return np.clip(np.rint(8 + 280 * image + rng.normal(size=image.shape) * np.sqrt(0.5 + 9 * image)), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 40.0])
-def test_a_parabola_is_enough(rig, rng, tilt):
+def test_a_parabola_is_enough(rig):
     """Without noise and blur, what is left out of the map over a window is far below its noise."""
-    x, image, centres, truth, gradient = board(rig, tilt, blur=0)
+    x, image, centres, truth, gradient = board(rig, 40.0, blur=0)
     found = correspondences(projector_map(x, image), np.full(image.shape, 200.0), centres, 38.0)
     assert np.abs(found.pixels - truth).max() < 2e-4  # float32 maps of 1000 px are exact to 3e-5
     assert found.gradient == pytest.approx(gradient, abs=2e-4)
@@ -82,18 +81,18 @@ def test_predicted_covariance_is_the_noise(tilted, rng):
     """Errors over predicted sigmas are standard normal; blurred edges of the discs included."""
     x, image, centres, truth, _ = tilted
     z = []
-    for _ in range(24):
+    for _ in range(10):
         found = correspondences(projector_map(x, image, rng), photograph(image, rng), centres, 38.0)
         z.append((found.pixels - truth) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)))
     z = np.array(z)
     assert np.isfinite(z).all()
-    assert abs(z.std() - 1) < 0.05  # 1680 values: 1.7 % standard error
+    assert abs(z.std() - 1) < 0.08  # 700 values: 2.7 % standard error
     assert abs(z.mean()) < 5 / np.sqrt(z.size)
     assert np.sqrt(found.covariance[:, 0, 0]).max() < 0.003
     assert (found.covariance[:, 0, 1] == 0).all()
 
 
-@pytest.mark.parametrize("blur", [0.6, 1.5, 3.0])
+@pytest.mark.parametrize("blur", [0.6, 3.0])
 def test_edges_do_not_bias(rig, rng, blur):
     """Pixels beside the discs' borders see the brighter side. Left in, they falsify the gradient, though hardly the value."""
     x, image, centres, truth, gradient = board(rig, 25.0, blur)
@@ -134,7 +133,7 @@ def test_errors_beyond_the_prediction_show(tilted, rng, kind):
     """Noise twice as large as predicted, or correlated between neighbours, gives errors that the covariance still covers."""
     x, image, centres, truth, _ = tilted
     z = []
-    for _ in range(8):
+    for _ in range(4):
         if kind == "larger":
             found = projector_map(x, image, rng, 2.0)
         else:
