@@ -48,7 +48,7 @@ def check(board, path, dpi):
 
 @pytest.mark.parametrize("name", BOARDS)
 def test_boards_are_found_true_to_scale(name, tmp_path):
-    check(BOARDS[name], tmp_path / "board.pdf", 120 if name == "chessboard" else 200)  # chessboards take OpenCV long
+    check(BOARDS[name], tmp_path / "board.pdf", 100 if name == "chessboard" else 150)  # chessboards take OpenCV long
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_cards_cut_out_are_found_on_a_dark_bench(name, tmp_path):
     """The quiet border is wide enough, and the caption beyond it disturbs nothing."""
     board, path = BOARDS[name], tmp_path / "board.pdf"
     sheet = sheet_of(board, path)
-    image, pixel = raster(path, 120 if name == "chessboard" else 200)
+    image, pixel = raster(path, 100 if name == "chessboard" else 150)
     width, height = board_drawing.card_of(board).size
     left, top = sheet.card[0], sheet.paper[1] - sheet.card[1] - height
     (x0, y0), (x1, y1) = (np.rint(np.array(corner) / pixel).astype(int) for corner in ((left, top), (left + width, top + height)))
