@@ -84,9 +84,14 @@ def test_computed_images_show_no_errors():
     assert np.abs(off).max() < 4 / np.pi * 0.5 / 127.5  # the largest by rounding to half a DN
 
 
-@pytest.mark.parametrize("n", [4, 5, 8, 18])
-@pytest.mark.parametrize(("scene", "most"), [(plane, 1.05), (skin, 1.1), (ball, 1.2), (steps, 1.05)])
-@pytest.mark.parametrize("gamma", [0.0, 0.03])
+LAMPS = [
+    pytest.param(n, scene, most, gamma, id=f"{gamma}-{scene.__name__}-{most}-{n}")
+    for n, gamma in ((4, 0.03), (5, 0.0), (8, 0.03), (18, 0.0))
+    for scene, most in ((plane, 1.05), (skin, 1.1), (ball, 1.2), (steps, 1.05))
+]
+
+
+@pytest.mark.parametrize(("n", "scene", "most", "gamma"), LAMPS)
 def test_phase_is_as_good_as_of_a_steady_lamp(rng, n, scene, most, gamma):
     """RMS nearly that of the undisturbed phase; what texture and size leave of the errors is in sigma."""
     seen = scene(rng)
@@ -99,7 +104,7 @@ def test_phase_is_as_good_as_of_a_steady_lamp(rng, n, scene, most, gamma):
     assert 0.95 < z.std() < 1.05
 
 
-@pytest.mark.parametrize("n", [4, 8, 12])
+@pytest.mark.parametrize("n", [4, 8])
 @pytest.mark.parametrize("scene", [plane, skin, ball, steps])
 def test_a_steady_sequence_stays_as_it_is(rng, n, scene):
     """Nothing is found, nothing is lost: the phase's noise and sigma grow by less than 1 %."""
@@ -112,9 +117,9 @@ def test_a_steady_sequence_stays_as_it_is(rng, n, scene):
 
 @pytest.mark.parametrize("n", [8, 12])
 def test_errors_are_found_to_their_uncertainty(rng, n):
-    """Of 12 draws, each over its standard deviation; what the mean gain, offset and shift would be isn't known."""
+    """Of 5 draws, each over its standard deviation; what the mean gain, offset and shift would be isn't known."""
     z = []
-    for _ in range(12):
+    for _ in range(5):
         images, shifts, _, truth = photograph(skin(rng), n, rng, LAMP)
         found = estimate(images, shifts)
         off = np.stack(found[:3]) - (truth - truth.mean(axis=1, keepdims=True))
