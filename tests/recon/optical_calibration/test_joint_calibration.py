@@ -256,10 +256,10 @@ def test_departure_sees_shape_and_not_place(rng):
 
 
 def test_halves_agree_as_predicted(cameras):
-    """Differences between two halves, over their predicted sigma, are standard normal: 6 sets, 99.9 %, for correlated numbers."""
+    """Differences between two halves, over their predicted sigma, are standard normal: 3 sets, 99.9 %, for correlated numbers."""
     free = free_parameters(DEVICES, dict.fromkeys(DEVICES, ("k1", "k2", "p1", "p2")))
     found = []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         poses = random_poses(cameras, 14, rng)
         whole = adjust(observe(cameras, poses, rng), Estimate(cameras, poses, BOARD.points()), free)
@@ -314,7 +314,7 @@ def test_evidence_of_lens_and_board_is_weighed_by_the_last_offsets(sizes, good, 
 
 def test_with_few_poses_the_lens_is_not_made_poorer_than_it_is(cameras, sizes):
     """Sets of four: no parameter is off by more than five of its standard deviations."""
-    for seed in range(5):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         found = joint_calibration.calibrate(
             sightings(cameras, random_poses(cameras, 4, rng), rng), BOARD, sizes
@@ -325,7 +325,7 @@ def test_with_few_poses_the_lens_is_not_made_poorer_than_it_is(cameras, sizes):
 
 def test_a_flat_board_stays_flat(cameras, sizes):
     """Within the micrometres that ten poses can't exclude; errors of points are predicted to grow by less than a third."""
-    for seed in range(3):
+    for seed in range(1):
         rng = np.random.default_rng(seed)
         seen = sightings(cameras, random_poses(cameras, 10, rng), rng)
         found = joint_calibration.calibrate(seen, BOARD, sizes, QUICK)

@@ -42,9 +42,9 @@ def results(cameras, seeds, monkeypatch, of_pose):
 
 
 def test_steady_poses_scatter_as_their_noise(cameras, monkeypatch):
-    """Of 6 sets: 1, to three standard errors of some 40 parameters in 14 poses each; without a warning."""
-    found, squared = results(cameras, range(6), monkeypatch, lambda k, rng: (cameras, BOARD.points()))
-    assert np.mean([one.scatter for one in found]) == pytest.approx(1, abs=0.15)
+    """Of 3 sets: 1, to three standard errors of some 40 parameters in 14 poses each; without a warning."""
+    found, squared = results(cameras, range(3), monkeypatch, lambda k, rng: (cameras, BOARD.points()))
+    assert np.mean([one.scatter for one in found]) == pytest.approx(1, abs=0.2)
     assert not any(one.warning for one in found) and 0.7 < squared < 1.4
     assert all(1 <= one.rise < 1.05 for one in found)
 
@@ -69,7 +69,7 @@ def test_a_device_that_is_touched_is_told(cameras, monkeypatch, moved):
     matrix = cameras["cam2"].matrix.copy()
     matrix[0, 2] += 0.1
     touched = {**cameras, "cam2": replace(cameras["cam2"], matrix=matrix)}
-    found, _ = results(cameras, range(3), monkeypatch, lambda k, rng: (touched if moved(k) else cameras, BOARD.points()))
+    found, _ = results(cameras, range(1), monkeypatch, lambda k, rng: (touched if moved(k) else cameras, BOARD.points()))
     assert all(one.warning and one.rise > 1.3 for one in found)
 
 
