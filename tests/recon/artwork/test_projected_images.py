@@ -32,11 +32,17 @@ def rounding_px(fringes):
     return 2 / fringes.steps * np.abs(np.sin(turns)).sum(axis=1).max() / 255 * fringes.pitch / (2 * np.pi)
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_images_decode_to_the_projectors_pixels(file):
+@pytest.fixture(scope="module", params=FILES, ids=lambda file: file.stem)
+def drawn(request):
+    """Each sequence and its images."""
+    patterns = sequence(request.param)
+    return patterns, projected_images.images(patterns)
+
+
+def test_images_decode_to_the_projectors_pixels(drawn):
     """Within 0.01 px, or what eight bits allow: coarse fringes of few steps, 64 px by three, are off by up to 0.034 px."""
-    patterns = sequence(file)
-    found = decode(seen(projected_images.images(patterns)), patterns, bits=12)
+    patterns, images = drawn
+    found = decode(seen(images), patterns, bits=12)
     height, width = found.status.shape
     for axis, values, true in (("columns", found.columns, np.arange(width)), ("rows", found.rows, np.arange(height)[:, None])):
         if axis not in patterns.axes:
@@ -48,10 +54,8 @@ def test_images_decode_to_the_projectors_pixels(file):
         assert np.nanmax(np.abs(values - true)) < allowed
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_black_and_white_is_black_and_white(file):
-    patterns = sequence(file)
-    images = projected_images.images(patterns)
+def test_black_and_white_is_black_and_white(drawn):
+    patterns, images = drawn
     shown = projected_images.shown(patterns)
     assert images.dtype == np.uint8 and images.shape == (patterns.count, *patterns.projector_size[::-1])
     assert len(shown) == patterns.count

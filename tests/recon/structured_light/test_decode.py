@@ -38,7 +38,7 @@ def smooth_maps(patterns, rng, shape=SHAPE):
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 2**31))
 def test_round_trip(name, seed):
     """Pattern -> camera -> decode gives back the map to the predicted noise, for arbitrary smooth maps and each sequence."""

@@ -10,7 +10,7 @@ from scenes.handheld.handheld_assembly import Ranges, as_designed, held
 from scenes.handheld.mesh_parts import merged
 from tests.scenes.handheld.closed_parts import check_closed
 
-VARIANTS = 24
+VARIANTS = 14
 DIRECTIONS = np.deg2rad(np.arange(0, 360, 5))
 
 
@@ -79,7 +79,7 @@ def covered(parts, target):
 
 
 def test_a_quarter_of_the_variants_hide_a_part_of_a_circle(variants, rig):
-    """28 % are meant to (some of those miss); 24 draws deviate by 9 % (one sigma). Hardly any hides all three circles."""
+    """28 % are meant to (some of those miss); 14 draws deviate by 12 % (one sigma). Hardly any hides all three circles."""
     hidden = np.array([covered(parts, rig.target) for parts in variants])
     some = (hidden > 0.02).any(axis=1)
     assert 0.08 <= some.mean() <= 0.5
@@ -88,7 +88,7 @@ def test_a_quarter_of_the_variants_hide_a_part_of_a_circle(variants, rig):
 
 def test_nothing_covers_a_circle_unless_asked_to(rig):
     ranges = Ranges(cable_in_front=0, finger_in_front=0, robot=0.3)
-    for k in range(8):
+    for k in range(4):
         parts = held(np.random.default_rng([9, k]), rig.target, ranges)
         assert covered(parts, rig.target).max() < 0.02, k
 
@@ -117,7 +117,7 @@ EYES = np.array([[60.0, -40, 600], [-120, 30, 600], [0, 250, 520]])  # in the ta
 
 @pytest.fixture(scope="module")
 def designed(rig):
-    return [as_designed(np.random.default_rng([7, k]), rig.target, rig.probe, EYES) for k in range(6)]
+    return [as_designed(np.random.default_rng([7, k]), rig.target, rig.probe, EYES) for k in range(3)]
 
 
 def test_the_array_s_face_lies_where_the_b_scan_begins(designed, rig):
