@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from recon.board_detection import reduced_images
+from recon.board_detection import lattice, reduced_images
 from recon.board_detection.detect import BoardNotFound, detect
 from recon.board_detection.kinds import aprilgrid, chessboard
 from recon.board_detection.kinds.aprilgrid import AprilGrid
@@ -100,6 +100,29 @@ def test_a_view_of_the_back_of_an_even_grid_is_mirrored(rng):
     pixels = CAMERA.project(rigid.apply(pose(board, 640, TILTED, 0.3), board.points())) * [-1, 1]
     with pytest.raises(BoardNotFound, match="mirrored"):
         assign(pixels, np.rint(board.points()[:, :2] / 15).astype(int), np.array([[1, 1], [-1, 1]]))
+
+
+def test_grids_that_grew_alike_are_placed_once_with_the_same_outcome(rng, monkeypatch):
+    """From seeds all over the points most grow into one grid, turned and shifted; placing each changes nothing but the time."""
+    cells = np.argwhere(np.ones((5, 6), int))[:, ::-1]
+    steps = np.array([[1, 0], [0, 1]])
+    drawn = []
+    for lost in (0, 0, 4, 9):
+        points = 20.0 * rng.permutation(cells)[lost:] @ np.array([[1.0, 0.2], [-0.2, 1.0]]) + rng.normal(0, 0.5, (30 - lost, 2))
+        drawn.append(np.concatenate([points, rng.uniform(-40, 160, (4, 2))]))
+    outcomes = [placed(points, cells, steps) for points in drawn]
+    numbers = iter(range(10**6))
+    monkeypatch.setattr(lattice, "_form", lambda _: next(numbers))
+    assert [placed(points, cells, steps) for points in drawn] == outcomes
+    assert {type(outcome) for outcome in outcomes} == {list, str}
+
+
+def placed(points, cells, steps):
+    """The numbers of the points, or the reason for none."""
+    try:
+        return assign(points, cells, steps).tolist()
+    except BoardNotFound as refusal:
+        return str(refusal)
 
 
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=lambda b: b.kind)
