@@ -7,11 +7,11 @@ one line each.
 
 import ast
 import inspect
+import pickle
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from copy import deepcopy
 from functools import cache, lru_cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -208,8 +208,8 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
     from omegaconf import MissingMandatoryValue, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    name = verb if primary(verb) else None
-    plain = [override for override in overrides if override.partition("=")[0] in _fields_named_like_groups(verb)]
+    name, known_groups, no_choices = verb if primary(verb) else None, groups(verb), _fields_named_like_groups(verb)
+    plain = [override for override in overrides if override.partition("=")[0] in no_choices]
     files = {k: file for k, override in enumerate(overrides) if (file := _own_choice(verb, override)) is not None}
     with TemporaryDirectory() if files else nullcontext("") as own:
         named = [_named(Path(own), k, files[k]) if k in files else override for k, override in enumerate(overrides)]
@@ -217,7 +217,7 @@ def compose(verb: str, overrides: Sequence[str], model: type[BaseModel] | None =
         quoted = [override for override in quoted if not _is_usual_null(verb, override, quoted)]
         for override in quoted:
             _check_choice(verb, override)
-        chosen = [override for override in quoted if _group(override) in groups(verb)]
+        chosen = [override for override in quoted if _group(override) in known_groups]
         if files:
             chosen.append(_searched(own))
             quoted.append(_searched(own))
@@ -287,7 +287,7 @@ def _composed(name: str | None, overrides: Sequence[str]) -> Any:
         return _by_hydra(name, overrides)
     choices = tuple(override for key, override in zip(keys, overrides, strict=True) if (folder() / key).is_dir())
     files = ((path, path.stat()) for path in sorted(folder().rglob("*.yaml")))
-    composed = deepcopy(_chosen(name, choices, tuple((path, about.st_mtime_ns, about.st_size) for path, about in files)))
+    composed = pickle.loads(_chosen(name, choices, tuple((path, about.st_mtime_ns, about.st_size) for path, about in files)))
     try:
         for override in overrides:
             if override not in choices:
@@ -299,9 +299,9 @@ def _composed(name: str | None, overrides: Sequence[str]) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _chosen(name: str | None, choices: Sequence[str], state: object) -> Any:
-    """Compose a verb's fields with choices alone; `state` is that of the files."""
-    return _by_hydra(name, choices)
+def _chosen(name: str | None, choices: Sequence[str], state: object) -> bytes:
+    """Compose a verb's fields with choices alone; `state` is that of the files. Pickled, as that is copied six times faster."""
+    return pickle.dumps(_by_hydra(name, choices))
 
 
 def _by_hydra(name: str | None, overrides: Sequence[str]) -> Any:
@@ -322,7 +322,7 @@ def _own_choice(verb: str, override: str) -> tuple[str, Path] | None:
     """The group, as it was written, and the file of a choice that is the path of a YAML file."""
     key, _, value = override.partition("=")
     path = Path(value.strip("'\""))
-    if key.partition("@")[0] not in groups(verb) or path.suffix not in (".yaml", ".yml") or not path.is_file():
+    if path.suffix not in (".yaml", ".yml") or key.partition("@")[0] not in groups(verb) or not path.is_file():
         return None
     _checked(path)
     return key, path
