@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -41,7 +42,7 @@ class Source(NamedTuple):
 def read(path: Path) -> Source:
     """Parse a file, which takes long, once for all tests."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    imports = [node for node in statements(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
     names |= {node.module or "" for node in imports if isinstance(node, ast.ImportFrom)}
     functions = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.decorator_list]
@@ -53,6 +54,15 @@ def read(path: Path) -> Source:
         {name: text for name, text in texts.items() if text.startswith(("njit", "kernel"))},
         {call.id for call in calls if isinstance(call, ast.Name)},
     )
+
+
+def statements(node: ast.AST) -> Iterator[ast.stmt]:
+    """All statements below a node, in functions too; expressions, of which most of a file is made, hold none."""
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, part, []):
+            if isinstance(child, ast.stmt):
+                yield child
+            yield from statements(child)
 
 
 def modules(package: str) -> list[str]:
