@@ -8,15 +8,15 @@ import pytest
 from recon.capture.board_part import read_board
 from sonotwin.cli import main
 
-SMALL = [  # both cameras at a quarter of their size
-    "rig.cam1.sensor.pixel_um=19.2",
-    "rig.cam1.optics.size=[320,256]",
-    "rig.cam1.optics.focal_px=[830.0,832.75]",
-    "rig.cam1.optics.centre_px=[154.125,130.375]",
-    "rig.cam2.sensor.pixel_um=19.2",
-    "rig.cam2.optics.size=[320,256]",
-    "rig.cam2.optics.focal_px=[829.5,832.25]",
-    "rig.cam2.optics.centre_px=[152.625,129.125]",
+SMALL = [  # both cameras at an eighth of their size
+    "rig.cam1.sensor.pixel_um=38.4",
+    "rig.cam1.optics.size=[160,128]",
+    "rig.cam1.optics.focal_px=[415.0,416.375]",
+    "rig.cam1.optics.centre_px=[76.8125,64.9375]",
+    "rig.cam2.sensor.pixel_um=38.4",
+    "rig.cam2.optics.size=[160,128]",
+    "rig.cam2.optics.focal_px=[414.75,416.125]",
+    "rig.cam2.optics.centre_px=[76.0625,64.3125]",
 ]
 
 
@@ -91,22 +91,23 @@ def test_both_cameras(tmp_path, capsys):
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     manifest = json.loads((tmp_path / "out" / "capture" / "manifest.json").read_text())
     assert sorted(manifest["surface"]["images"]) == ["cam1", "cam2"]
-    assert manifest["devices"]["cam2"] == {"size": [320, 256], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
+    assert manifest["devices"]["cam2"] == {"size": [160, 128], "bits": 10, "exposure_s": 0.02, "gain": 1.0}
     assert sorted(path.name for path in (tmp_path / "out" / "truth" / "surface").iterdir()) == ["cam1.npz", "cam2.npz"]
     assert "exposure 20.00 ms" in capsys.readouterr().out
 
 
 def test_a_board_in_poses(tmp_path, capsys):
-    """Two poses with warp and print errors: what the reader finds, and the truth beside it."""
+    """Two poses of a few circles with warp and print errors: what the reader finds, and the truth beside it."""
     fields = ["scene=board", "poses=demo", "poses.count=2", "patterns=paper_calibration", "cameras=[cam1,cam2]"]
+    fields += ["scene.columns=3", "scene.rows=5"]
     fields += [*SMALL, "tracing.samples=2", "scene.warp_mm=0.2", "scene.print_error_mm=0.02"]
     assert main(["render", f"out={tmp_path / 'out'}", *fields]) == 0
     found = read_board(tmp_path / "out" / "capture")
     assert (found.poses, found.cameras) == (("00", "01"), ("cam1", "cam2"))
     pose = found.pose(1)
-    assert pose.fringes.shape == (50, 256, 320) and pose.lit["cam2"].shape == (256, 320)
+    assert pose.fringes.shape == (50, 128, 160) and pose.lit["cam2"].shape == (128, 160)
     truth = np.load(tmp_path / "out" / "truth" / "board.npz")
-    assert truth["world_from_board"].shape == (2, 4, 4) and truth["pixels"].shape == (2, 44, 3, 2)
+    assert truth["world_from_board"].shape == (2, 4, 4) and truth["pixels"].shape == (2, 15, 3, 2)
     apart = truth["points"] - found.board.points()
     assert 0.01 < apart[:, :2].std() < 0.04 and 0.1 < np.abs(apart[:, 2]).max() <= 0.2
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["capture", "truth"]
