@@ -297,8 +297,10 @@ def test_poses_that_fail_alike_are_one_line():
 
 
 def test_a_third_camera_is_warned_of(copied, tmp_path, capsys):
+    """In five poses."""
     capture = copied / "capture"
     manifest = json.loads((capture / "manifest.json").read_text())
+    del manifest["board"]["poses"][5:]
     for pose in manifest["board"]["poses"]:
         pose["lit"]["cam3"] = pose["lit"]["cam2"]
     manifest["devices"]["cam3"] = manifest["devices"]["cam2"]
