@@ -397,7 +397,7 @@ def volume(scans: Scans, settings: VolumeSettings, most_bytes: int = MOST_BYTES)
         settings.compounding,
         settings.interpolation,
         clip,
-        None if mask is None else repeat(mask),
+        None if mask is None else repeat(mask, len(scans.world_from_pixel)),
         most_bytes=most_bytes,
         arithmetic=settings.arithmetic,
         weights=weights,
