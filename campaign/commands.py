@@ -35,6 +35,7 @@ class Outcome:
 
 
 Run = Callable[[Sequence[str], Path, float], Outcome]  # of arguments in a folder, for some seconds at most
+Kill = Callable[[Sequence[str], Path, int, float], tuple[int, bool]]  # of arguments in a folder, by a signal after some seconds
 
 
 def run(arguments: Sequence[str], folder: Path, longest_s: float) -> Outcome:
@@ -52,6 +53,18 @@ def run(arguments: Sequence[str], folder: Path, longest_s: float) -> Outcome:
         text = said.read().decode(errors="backslashreplace")
     status = process.returncode if process.returncode >= 0 else 128 - process.returncode
     return Outcome(status, text, seconds, peak_mb, changes(before, snapshot(folder)))
+
+
+def kill(arguments: Sequence[str], folder: Path, number: int, after_s: float) -> tuple[int, bool]:
+    """Begin a command and send it a signal after some seconds; its session, and whether it had ended by itself before."""
+    process = begin(arguments, folder, subprocess.DEVNULL)
+    try:
+        process.wait(after_s)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+        process.wait()
+        return process.pid, False
+    return process.pid, True
 
 
 def memory_mb(process: int, field: str = "VmHWM") -> float:

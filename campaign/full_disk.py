@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from campaign import commands, results, sources
+from campaign.commands import Run
 from campaign.sources import COMMANDS, Command
 
 LONGEST_S = 300.0
@@ -67,24 +68,24 @@ def writers() -> list[Command]:
     return list(reversed(firsts.values()))
 
 
-def run(place: Path, only: Sequence[str] = ()) -> list[Full]:
+def run(place: Path, only: Sequence[str] = (), run_one: Run = commands.run) -> list[Full]:
     """Fill the disk of each command to some shares of what it needs."""
     found = []
     for command in writers():
         if not only or command.verb in only:
             with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
-                found += fill(place, command, Path(name))
+                found += fill(place, command, Path(name), run_one)
     return found
 
 
-def fill(place: Path, command: Command, folder: Path) -> list[Full]:
+def fill(place: Path, command: Command, folder: Path, run_one: Run = commands.run) -> list[Full]:
     """Run one command on disks that hold an old result and are too small for another one."""
     sources.lay_out(folder, place, command.folders)
     disk, old = folder / "disk", folder / "old"
     disk.mkdir()
     line = (command.verb, *command.fields, f"out=disk/{command.out}")
     with small_disk(disk, 1 << 32):
-        first = commands.run(line, folder, LONGEST_S)
+        first = run_one(line, folder, LONGEST_S)
         if first.status:
             raise RuntimeError(f"sonotwin {' '.join(line)}: {first.said}")
         shutil.copytree(disk, old)
@@ -93,7 +94,7 @@ def fill(place: Path, command: Command, folder: Path) -> list[Full]:
     for share in SHARES:
         with small_disk(disk, size + int(share * size)):
             shutil.copytree(old, disk, dirs_exist_ok=True)
-            outcome = commands.run((*line, *anew(command.verb)), folder, LONGEST_S)
+            outcome = run_one((*line, *anew(command.verb)), folder, LONGEST_S)
             kept = outcome.status == 0 or _kept(results.digests(old), results.digests(disk), command.verb in GROWING)
             found.append(Full(command.verb, share, outcome, kept, tuple(results.leftovers(disk))))
     return found

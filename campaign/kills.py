@@ -3,7 +3,6 @@
 import random
 import shutil
 import signal
-import subprocess
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -12,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from campaign import commands, results, sources
+from campaign.commands import Kill, Run
 
 LONGEST_S = 300.0
 IN_A_ROW = 5  # kills before the command is let run to its end
@@ -71,14 +71,22 @@ class Tally:
         return not (self.torn or self.orphans or self.other_bytes or self.left or self.failed)
 
 
-def run(place: Path, moments: int, seed: int, workers: int, only: Sequence[str] = ()) -> list[Tally]:
+def run(
+    place: Path,
+    moments: int,
+    seed: int,
+    workers: int,
+    only: Sequence[str] = (),
+    command: Run = commands.run,
+    kill: Kill = commands.kill,
+) -> list[Tally]:
     """Kill each command at a number of moments by each signal."""
     jobs = [(killed, number) for killed in KILLED if not only or killed.verb in only for number in SIGNALS]
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda job: kill(place, job[0], job[1], moments, seed), jobs))
+        return list(pool.map(lambda job: _killed(place, *job, moments, seed, command, kill), jobs))
 
 
-def kill(place: Path, killed: Killed, number: signal.Signals, moments: int, seed: int) -> Tally:
+def _killed(place: Path, killed: Killed, number: signal.Signals, moments: int, seed: int, command: Run, kill: Kill) -> Tally:
     """Kill one command by one signal."""
     rng, tally = random.Random(f"{seed} {killed.verb} {number}"), Tally(killed.verb, number.name)
     with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
@@ -87,16 +95,18 @@ def kill(place: Path, killed: Killed, number: signal.Signals, moments: int, seed
         kept, old = folder / "kept", dict[str, str]()
         kept.mkdir()
         if killed.first:
-            old, _ = _unbroken(folder, killed.first)
+            old, _ = _unbroken(folder, killed.first, command)
             shutil.copytree(folder / "new", kept, dirs_exist_ok=True)
-        new, seconds = _unbroken(folder, killed.then)
+        new, seconds = _unbroken(folder, killed.then, command)
         while tally.kills < moments:
             shutil.rmtree(folder / "new")
             shutil.copytree(kept, folder / "new")
             for _ in range(min(IN_A_ROW, moments - tally.kills)):
-                _kill_once(folder, killed.then, number, rng.uniform(0.0, 1.05 * seconds), tally)
+                session, ended = kill(killed.then, folder, number, rng.uniform(0.0, 1.05 * seconds))
+                tally.kills, tally.completed = tally.kills + 1, tally.completed + ended
+                tally.orphans += _orphans(session)
                 tally.torn += _faults(folder / "new", killed, old, new)
-            outcome = commands.run(killed.then, folder, LONGEST_S)
+            outcome = command(killed.then, folder, LONGEST_S)
             if outcome.status:
                 tally.failed.append(outcome.said.strip())
                 continue
@@ -109,28 +119,21 @@ def kill(place: Path, killed: Killed, number: signal.Signals, moments: int, seed
     return tally
 
 
-def _unbroken(folder: Path, line: tuple[str, ...]) -> tuple[dict[str, str], float]:
+def _unbroken(folder: Path, line: tuple[str, ...], command: Run) -> tuple[dict[str, str], float]:
     """Digests and duration of a run that isn't killed."""
-    outcome = commands.run(line, folder, LONGEST_S)
+    outcome = command(line, folder, LONGEST_S)
     if outcome.status:
         raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
     return results.digests(folder / "new"), outcome.seconds
 
 
-def _kill_once(folder: Path, line: tuple[str, ...], number: signal.Signals, after_s: float, tally: Tally) -> None:
-    process = commands.begin(line, folder, subprocess.DEVNULL)
-    try:
-        process.wait(after_s)
-        tally.completed += 1
-    except subprocess.TimeoutExpired:
-        process.send_signal(number)
-        process.wait()
-    tally.kills += 1
+def _orphans(session: int) -> int:
+    """Number of processes of a killed command that go on; they are ended."""
     until = time.perf_counter() + ORPHANS_S
-    while (alive := results.processes_of(process.pid)) and time.perf_counter() < until:
+    while (alive := results.processes_of(session)) and time.perf_counter() < until:
         time.sleep(0.05)
-    tally.orphans += len(alive)
     results.end(alive)
+    return len(alive)
 
 
 def _faults(folder: Path, killed: Killed, old: dict[str, str], new: dict[str, str]) -> list[str]:

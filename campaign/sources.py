@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from campaign import commands
+from campaign.commands import Run
 from recon.capture import probe_files, surface_part, sweep_part
 from recon.devices.openigtlink import igtl_messages
 from recon.files import atomic
@@ -157,12 +158,12 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def make(folder: Path, names: Collection[str] | None = None) -> None:
+def make(folder: Path, names: Collection[str] | None = None, command: Run = commands.run) -> None:
     """Make some sources, or all and what no command writes, as far as they aren't there; RuntimeError if a command fails."""
     folder.mkdir(parents=True, exist_ok=True)
     for line in MADE:
         if (names is None or _out(line) in names) and not (folder / _out(line)).exists():
-            outcome = commands.run(line, folder, LONGEST_S)
+            outcome = command(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
     if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml")):

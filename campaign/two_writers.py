@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 
 from campaign import commands, results, sources
+from campaign.commands import Run
 from campaign.kills import KILLED, Killed
 
 LONGEST_S = 600.0
@@ -46,14 +47,14 @@ def run(place: Path, rounds: int, only: Sequence[str] = ()) -> list[Pair]:
     ]
 
 
-def both(place: Path, killed: Killed, first: tuple[str, ...], rounds: int) -> list[Pair]:
-    """Run two command lines at once."""
+def both(place: Path, killed: Killed, first: tuple[str, ...], rounds: int, command: Run = commands.run) -> list[Pair]:
+    """Run two command lines at once, each first alone, by `command`."""
     with TemporaryDirectory(dir=place.parent, ignore_cleanup_errors=True) as name:
         folder = Path(name)
         sources.lay_out(folder, place, killed.folders)
         alone = []
         for line in dict.fromkeys((first, killed.then)):
-            outcome = commands.run((*line[:-1], f"out=alone{len(alone)}"), folder, LONGEST_S)
+            outcome = command((*line[:-1], f"out=alone{len(alone)}"), folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
             alone.append(results.digests(folder / f"alone{len(alone)}"))

@@ -1,6 +1,7 @@
 """A sample of the campaign; all of it takes hours and is run by `make campaign`."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,19 +28,25 @@ COUNT = 28  # two of each verb
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
+def copies() -> Iterator[forked.Copies]:
+    """Commands without the seconds that their imports take."""
+    with forked.copies() as commands:
+        yield commands
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, copies) -> Path:
     folder = tmp_path_factory.mktemp("campaign") / "sources"
-    sources.make(folder, NAMES)
+    sources.make(folder, NAMES, copies.run)
     return folder
 
 
 @pytest.mark.slow
-def test_bad_inputs_are_refused(place):
+def test_bad_inputs_are_refused(place, copies):
     """Some of every verb's whose sources are quickly made; how long they take isn't tested: machines are noisy."""
     few = [command for command in COMMANDS if set(command.folders) <= NAMES and not command.minutes]
     chosen = bad_inputs.chosen(bad_inputs.cases(place, few), COUNT, seed=21)
-    with forked.copies() as command:
-        found = bad_inputs.run(chosen, place, workers=1, command=command)
+    found = bad_inputs.run(chosen, place, workers=1, command=copies.run)
     wrong = {f"{one.case.command.verb} {one.case.fault}": (one.fault, one.outcome.said) for one in found if one.fault}
     assert not {name: fault for name, fault in wrong.items() if fault[0] != "slow"}
 
@@ -68,23 +75,25 @@ def test_mistakes_are_made_and_judged(place, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_commands_lose_nothing(place):
+def test_killed_commands_lose_nothing(place, copies):
     """One that replaces a folder, by both signals; `reconstruct`, which goes on with its own, and recordings have theirs."""
-    tallies = kills.run(place, moments=3, seed=3, workers=1, only=["sweep"])
+    tallies = kills.run(place, moments=2, seed=3, workers=1, only=["sweep"], command=copies.run, kill=copies.kill)
     assert all(tally.good for tally in tallies), tallies
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not full_disk.can_mount(), reason="a small disk can't be mounted")
-def test_full_disks_are_named_and_old_results_kept(place):
-    found = full_disk.run(place, only=["freehand", "sweep"])
+def test_full_disks_are_named_and_old_results_kept(place, copies):
+    found = full_disk.run(place, ["freehand", "sweep"], copies.run)
     assert len(found) == 6 and all(one.good and one.outcome.status == 2 for one in found), full_disk.table(found)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not two_writers.can_part(), reason="no process namespaces")
-def test_two_writers_dont_mix(place):
-    pairs = two_writers.run(place, rounds=1, only=["surface"])
+def test_two_writers_dont_mix(place, copies):
+    """With settings of their own, so that a mixture shows."""
+    (surface,) = (killed for killed in kills.KILLED if killed.verb == "surface")
+    pairs = two_writers.both(place, surface, surface.first, 1, copies.run)
     assert pairs and all(pair.good for pair in pairs), pairs
 
 
@@ -97,5 +106,6 @@ def test_readers_survive_some_fuzzing(place):
 
 @pytest.mark.slow
 def test_memory_stays_as_it_is(place):
-    found = soak.run(place, "freehand", 1500)
+    """A B-scan that is kept makes 0.1 MB of 600, so 45 MB."""
+    found = soak.run(place, "freehand", 600)
     assert found.growth_mb < 20
