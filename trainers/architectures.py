@@ -28,10 +28,14 @@ def network(name: Name, circles: int) -> nn.Module:
     if not is_detector(name):
         return {"segmenter": Segmenter, "published_segmenter": PublishedSegmenter}[name]()
     module = {"detector": Detector, "published_detector": PublishedDetector}[name](circles=circles)
-    with torch.no_grad():  # most cells show nothing; without that from the start the first hundred steps learn just this
-        bias = module.get_parameter("convD.3.bias" if name.startswith("published") else "detection.3.bias")
-        bias[NO_PIXEL] = math.log(NO_PIXEL * CELLS_A_CIRCLE)
+    begin_with_nothing(module.get_parameter("convD.3.bias" if name.startswith("published") else "detection.3.bias"))
     return module
+
+
+def begin_with_nothing(bias: nn.Parameter) -> None:
+    """Set a detector's bias (65,) for cells that show nothing, as most do; else the first hundred steps learn just this."""
+    with torch.no_grad():
+        bias[NO_PIXEL] = math.log(NO_PIXEL * CELLS_A_CIRCLE)
 
 
 def is_detector(name: Name) -> bool:
