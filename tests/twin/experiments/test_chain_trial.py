@@ -31,9 +31,9 @@ LEFT_MM = 0.002  # of points, pixels and masses that nothing disturbs
 ZERO = dict.fromkeys(Drawn.model_fields, 0.0)
 
 
-def alone(settings, life: Conditions = IDEAL, speed_mm_s: float = 10.0, **drawn: float):
-    """Settings with the errors that are given, and no others."""
-    noise = Noise(drawn=Drawn(**ZERO | drawn), speed_mm_s=speed_mm_s)
+def alone(settings, life: Conditions = IDEAL, speed_mm_s: float = 10.0, frames: int = 40, **drawn: float):
+    """Settings with the errors that are given, and no others; so many B-scans of the wires and over the mass."""
+    noise = Noise(drawn=Drawn(**ZERO | drawn), speed_mm_s=speed_mm_s, wires=frames, scans=frames)
     return settings.model_copy(update={"noise": noise, "conditions": life})
 
 
@@ -113,6 +113,9 @@ READ = {  # sizes by which each condition that the chain reads shows
 }
 
 
+FEW = 12  # B-scans, where their number isn't the question
+
+
 @pytest.mark.slow
 def test_conditions_that_are_not_read_change_nothing(settings, quiet):
     """Lamp, skin, tremor and ink on the board: the same figures to 1e-8 mm, where repetitions differ by 1e-9."""
@@ -122,14 +125,14 @@ def test_conditions_that_are_not_read_change_nothing(settings, quiet):
         skin=Skin(spread_mm=1, wet=0.5),
         motion=Motion(tremor_mm=1, tremor_deg=1),
     )
-    assert chain_trial.measure(alone(settings, unread), 1) == pytest.approx(quiet, abs=1e-8)
+    assert chain_trial.measure(alone(settings, unread, frames=FEW), 1) == pytest.approx(quiet, abs=1e-8)
     assert {f"conditions.{name}" for name in READ} == set(chain_trial.CONDITIONS)
 
 
 @pytest.fixture(scope="module")
 def quiet(settings):
     """Figures of a session that nothing disturbs."""
-    return chain_trial.measure(alone(settings), 1)
+    return chain_trial.measure(alone(settings, frames=FEW), 1)
 
 
 @pytest.mark.slow
@@ -140,7 +143,7 @@ def test_each_condition_that_is_read_changes_a_figure(settings, quiet, name):
     A bracket that doesn't give leaves nothing to scale, so that its drawn errors alone change nothing.
     """
     drawn = {"bracket_at_wires": 1.0, "bracket_in_scan": 1.0} if "bracket" in name else {}
-    found = chain_trial.measure(alone(settings, READ[name], **drawn), 1)
+    found = chain_trial.measure(alone(settings, READ[name], frames=FEW, **drawn), 1)
     assert max(abs(found[figure] / quiet[figure] - 1) for figure in chain_trial.EXPERIMENT.limits) > 1e-3
 
 
@@ -226,29 +229,28 @@ def together(trials: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("sources", "known"),
-    [(("circle_in_scan",), "poses"), (("crossing", "beside", "circle_at_wires"), "probe")],
-    ids=["poses", "probe"],
-)
-def test_switched_sources_err_as_is_predicted(settings, monkeypatch, sources, known):
-    """Root mean squares of pixels in 30 sessions, to 35 %; their optics are without errors, and so are the same."""
+def test_errors_of_the_probes_calibration_are_as_predicted(settings, monkeypatch):
+    """Root mean squares of pixels in 30 sessions of few B-scans, to 35 %; their optics are without errors, and so are the same.
+
+    Crossings, hands beside the wires and circles err. Predictions that are half or twice as large miss by far.
+    """
     optics = drawn_session.calibrated_optics(settings.rig, IDEAL, alone(settings).noise, settings.poses, 0)
     monkeypatch.setattr(drawn_session, "calibrated_optics", lambda *_: optics)
-    chosen = alone(settings, **dict.fromkeys(sources, 1.0))
+    chosen = alone(settings, frames=FEW, crossing=1.0, beside=1.0, circle_at_wires=1.0)
     trials = [chain_trial.measure(chosen, seed) for seed in range(30)]
-    switched, predicted = together([(trial["pixel_rms_mm"], trial[f"pixel_predicted_by_{known}_mm"]) for trial in trials])
+    switched, predicted = together([(trial["pixel_rms_mm"], trial["pixel_predicted_by_probe_mm"]) for trial in trials])
     assert switched == pytest.approx(predicted, rel=0.35)
 
 
 @pytest.mark.slow
 def test_boards_and_columns_noise_err_as_is_predicted(settings):
-    """Root mean squares of points by 30 calibrations, to 35 %, with the board's scale and the drift that are predicted.
+    """Root mean squares of points by 12 calibrations, to 35 %, with the board's scale and the drift that are predicted.
 
-    The scale is one number a session: of 30 its root mean square scatters by an eighth. No probe is led.
+    The scale is one number a session: of 12 its root mean square scatters by a fifth. Predictions that are half or twice as
+    large miss; their parts are compared above. No probe is led.
     """
     level, trials = alone(settings, IN_USE, board=1.0, column=1.0).noise, []
-    for seed in range(30):
+    for seed in range(12):
         optics = drawn_session.calibrated_optics(settings.rig, IN_USE, level, settings.poses, seed)
         used = calibration_of(drifted(settings.rig, IN_USE.drift, seed))
         found = drawn_session.Session(used, optics, None, None, None, None, None, 0.0)

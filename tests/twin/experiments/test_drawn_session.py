@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 from recon.errors import InputError
-from recon.freehand import place_uncertainty, sequences
-from recon.freehand.place_uncertainty import PlaceErrors
 from recon.geometry import rigid
 from recon.model import circle_layout
-from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from twin.conditions import IDEAL, Conditions, Motion
 from twin.experiments import drawn_session
@@ -65,14 +62,17 @@ def test_poses_without_noise_are_the_true_ones(rig):
 
 @pytest.mark.slow
 def test_poses_err_as_their_covariance_says(rig):
-    """Squares of 400 poses' errors by their covariances: 6 in the mean, to 5 standard deviations; half the noise, a quarter."""
-    images, held, velocity = (np.concatenate([each] * 10) for each in scan(rig))
+    """Squares of 80 poses' errors by their covariances: 6 in the mean, to 4 standard deviations; half the noise, a quarter.
+
+    Standard deviations that are too small or too large by a sixth are found out.
+    """
+    images, held, velocity = (np.concatenate([each] * 2) for each in scan(rig))
     mean = []
     for drawn in (1.0, 0.5):
-        found = drawn_session.look(eye(rig, drawn), images, held, np.zeros((400, 2)), velocity, [7])
+        found = drawn_session.look(eye(rig, drawn), images, held, np.zeros((80, 2)), velocity, [7])
         off = differences(found.poses, true_targets(images, held))
         mean.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.own), off).mean())
-    assert mean == pytest.approx([6, 1.5], rel=5 * np.sqrt(2 / 6 / 400))
+    assert mean == pytest.approx([6, 1.5], rel=4 * np.sqrt(2 / 6 / 80))
 
 
 def test_cameras_that_are_late_see_the_target_farther_on(rig):
@@ -143,22 +143,6 @@ def test_crossings_are_found_with_noise_of_the_size_that_is_drawn(rig, scanners,
         assert (seen[size].pixels - seen[0].pixels).std(axis=0) == pytest.approx(0.4 * size, rel=0.15)
         assert np.array_equal(seen[0].pixel_covariance, seen[size].pixel_covariance)
     assert seen[0].pixel_covariance[0, 0, 0] == pytest.approx(0.4**2)
-
-
-@pytest.mark.slow
-def test_probes_err_as_their_covariance_says(rig, scanners):
-    """20 calibrations with noisy crossings and hands beside the wires: RMS error of pixels' places, to 30 %."""
-    noise = QUIET.model_copy(update={"drawn": OFF.model_copy(update={"crossing": 1.0, "beside": 1.0})})
-    pixels = np.array([[0.0, 0.0], [320.0, 0.0], [160.0, 200.0], [0.0, 407.0], [320.0, 407.0]])
-    truth = ProbeCalibration(rig.probe.target_from_image.matrix(), np.array(rig.probe.scale_mm_per_px)).to_target(pixels)
-    none = PlaceErrors(np.zeros((1, 6, 6)), np.eye(1), np.zeros((1, 6, 6)), np.zeros((1, 4, 4)))
-    off, claimed = [], []
-    for seed in range(20):
-        found = drawn_session.calibrated_probe(rig, eye(rig, 0.0), IDEAL, noise, 1.0, scanners["water"], seed)
-        off.append(np.linalg.norm(found.to_target(pixels) - truth, axis=-1))
-        form = place_uncertainty.forms(sequences.target_from_pixel(found)[None], found, none)
-        claimed.append(place_uncertainty.sigmas(form, pixels))
-    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(np.sqrt(np.mean(np.square(claimed))), rel=0.3)
 
 
 @pytest.fixture(scope="module")
