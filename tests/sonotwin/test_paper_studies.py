@@ -1,13 +1,25 @@
-"""The paper's experiments in a reduced form: one laboratory, few poses of the board, both methods on the same images."""
+"""The paper's experiments in a reduced form: one laboratory, few poses of the board, both methods on the same images.
+
+Cameras have half the size, and few rays a pixel.
+"""
 
 import pytest
 
 from sonotwin import choices, study_accuracy
+from tests.twin.small_rigs import half
+from twin.experiments import probe_accuracy, tank_trial, tube_accuracy
 from twin.experiments.drawn_session import ROLL_DEG
+from twin.optics.light_transport import Tracing
 from twin.studies import beside_paper
 from twin.ultrasound.probe_path import WirePath
 
-FEW = {"over": {"conditions": ["lifelike"]}, "seeds": 1, "first_seed": 3}
+FEW = {
+    "over": {"conditions": ["lifelike"]},
+    "seeds": 1,
+    "first_seed": 3,
+    "rig": half(choices.read_rig(study_accuracy.RIG)),
+    "tracing": Tracing(samples=4, room_lux=20),
+}
 POSES = choices.read("poses", "paper")
 
 
@@ -16,22 +28,33 @@ def kept(tmp_path_factory):
     return tmp_path_factory.mktemp("paper")
 
 
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch):
+    monkeypatch.setattr(study_accuracy, "WORKERS", 1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["planes", "sphere"])
 def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
-    """Under lifelike conditions; where noise limits a figure, ours is within a fourth of that."""
+    """Under lifelike conditions; where noise limits a figure, ours is within a third of that: few rays leave noise of their own.
+
+    The paper's method comes to twice the limit.
+    """
     config, done = study_accuracy.study(kept, name, **FEW, poses=POSES | {"count": 8})
     compared = beside_paper.compare(config.beside, done)
     assert len(compared) == len(config.beside) and all(one.bar_met for one in compared)
     assert all(one.paper.max() > one.ours.max() for one in compared)
-    assert all(one.ours.max() < 1.25 * one.limit for one in compared if one.figure.limit)
+    assert all(one.ours.max() < 1.33 * one.limit for one in compared if one.figure.limit)
     assert len(list((kept / "trials").glob("*.json"))) == 1  # planes and sphere are figures of the same laboratory
 
 
 @pytest.mark.slow
-def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept):
-    """Five calibrations of the probe with fewer poses than the paper's, and both cylinders."""
-    few = FEW | {"poses": POSES | {"count": 12}, "wire_path": WirePath(count=18, roll_deg=ROLL_DEG)}
+def test_in_the_tank_ours_is_nearer_to_the_truth_than_the_papers_method(kept, monkeypatch):
+    """Three calibrations of the probe with fewer poses than the paper's five, and both cylinders, by half as many slices."""
+    monkeypatch.setattr(probe_accuracy, "CALIBRATIONS", 3)
+    monkeypatch.setattr(tube_accuracy, "SLICES", 47)
+    monkeypatch.setattr(tank_trial, "CAMERA_HZ", 10.0)
+    few = FEW | {"poses": POSES | {"count": 12}, "wire_path": WirePath(count=14, roll_deg=ROLL_DEG)}
     (_, (one,)) = study_accuracy.study(kept, "probe", **few)
     figures = one.figures
     for figure in ("cr1_mean", "probe_error", "tube_diameter_error", "cover_diameter_error"):

@@ -1,6 +1,26 @@
 """Devices of fewer pixels, for images that render in a moment."""
 
-from recon.model.rig import CameraDevice
+from recon.model.rig import CameraDevice, Rig
+
+
+def half(rig: Rig) -> Rig:
+    """A rig whose cameras have pixels of twice the size, a quarter as many."""
+    devices = {name: shrunk(getattr(rig, name), 2) for name in ("cam1", "cam2")}
+    sensors = {
+        name: device.sensor.model_copy(update={"pixel_um": 2 * device.sensor.pixel_um}) for name, device in devices.items()
+    }
+    return rig.model_copy(update={name: device.model_copy(update={"sensor": sensors[name]}) for name, device in devices.items()})
+
+
+def half_as_fields(rig: Rig) -> list[str]:
+    """The same on a command line."""
+    devices = {name: getattr(half(rig), name) for name in ("cam1", "cam2")}
+    optics = [
+        f"rig.{name}.optics.{field}={list(getattr(device.optics, field))}".replace(" ", "")
+        for name, device in devices.items()
+        for field in ("size", "focal_px", "centre_px")
+    ]
+    return optics + [f"rig.{name}.sensor.pixel_um={device.sensor.pixel_um}" for name, device in devices.items()]
 
 
 def shrunk(device: CameraDevice, times: int) -> CameraDevice:
