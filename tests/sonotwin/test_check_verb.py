@@ -15,6 +15,7 @@ from recon.probe_calibration.sound_in_water import speed_of_sound
 from scenes.board_poses import Config as Poses
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
+from tests.twin.small_rigs import half, half_as_fields
 from twin.conditions import IDEAL
 from twin.experiments.drawn_session import Noise, calibrated_optics
 
@@ -98,10 +99,13 @@ RENDERED = ["cameras=[cam1,cam2]", "scene=breast", "patterns=paper_calibration",
 
 @pytest.fixture(scope="module")
 def drifted(rig, tmp_path_factory):
-    """A folder with a calibration that errs as it says, and a film of the target by cameras that have drifted since."""
+    """A folder with a calibration that errs as it says, and a film of the target by cameras that have drifted since.
+
+    Cameras have half the size.
+    """
     folder = tmp_path_factory.mktemp("drifted")
-    calibration_files.write(folder / "optics.yaml", calibrated_optics(rig, IDEAL, Noise(), Poses(), SEED))
-    assert main(["film", f"out={folder}", "frames=16", "path.turn_deg=20", "white_dn=120", *LIFE]) == 0
+    calibration_files.write(folder / "optics.yaml", calibrated_optics(half(rig), IDEAL, Noise(), Poses(count=16), SEED))
+    assert main(["film", f"out={folder}", "frames=16", "path.turn_deg=20", "white_dn=120", *LIFE, *half_as_fields(rig)]) == 0
     return folder
 
 
@@ -112,7 +116,7 @@ def test_a_rendered_rig_is_as_calibrated_but_for_a_projector_that_was_shifted(ri
     x, y, z = rig.projector.optics.device_from_world.translation_mm
     moved = f"rig.projector.optics.device_from_world.translation_mm=[{x + shift_mm},{y + shift_mm},{z}]"
     shutil.copytree(drifted / "capture", tmp_path / "capture")
-    assert main(["render", f"out={tmp_path}", "add=true", moved, *RENDERED]) == 0
+    assert main(["render", f"out={tmp_path}", "add=true", *half_as_fields(rig), moved, *RENDERED]) == 0
     line = ["check", f"capture={tmp_path / 'capture'}", f"calibration={drifted / 'optics.yaml'}", f"out={tmp_path / 'check'}"]
     assert main(line) == (1 if shift_mm else 0)
     states = {one["part"]: one["state"] for one in json.loads((tmp_path / "check/check.json").read_text())["parts"]}
