@@ -21,19 +21,20 @@ from sonotwin.open_devices import LiveDevices
 from sonotwin.terminal_operator import TerminalOperator
 from sonotwin.verbs import record
 from sonotwin.verbs.record import Config
+from tests.twin.small_rigs import half_as_fields
 
 QUIET = ("preview.serve=false", "tracing.samples=4")
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,0]", "path.speed_mm_s=20", "frames.quality.rim=2")
 
 
 @pytest.mark.slow
-def test_a_recorded_surface_is_as_good_as_a_rendered_one(tmp_path):
-    """Of a sphere, under the same light and exposure: errors over a million points agree within a twentieth."""
-    scene = ("scene=sphere", "tracing.samples=4")
+def test_a_recorded_surface_is_as_good_as_a_rendered_one(tmp_path, rig):
+    """Of a sphere, under the same light and exposure: errors over a quarter of a million points agree within a twentieth."""
+    scene = ("scene=sphere", "tracing.samples=4", *half_as_fields(rig))
     assert cli.main(["render", *scene, "cameras=[cam1]", f"out={tmp_path}/made"]) == 0
     exposure = f"exposing.exposure_s={read_manifest(tmp_path / 'made/capture').devices['cam1'].exposure_s}"
     optics = f"calibration={tmp_path}/made/capture/calibration/optics.yaml"
-    fields = ("scene=sphere", *QUIET, "cameras=[cam1]", exposure, optics)
+    fields = (*scene, "preview.serve=false", "cameras=[cam1]", exposure, optics)
     assert cli.main(["record", "part=surface", *fields, f"out={tmp_path}/own"]) == 0
     rms = {}
     for name, capture in (("made", "made/capture"), ("own", "own")):
@@ -44,16 +45,17 @@ def test_a_recorded_surface_is_as_good_as_a_rendered_one(tmp_path):
 
 
 @pytest.mark.slow
-def test_boards_and_sweeps_grow_in_one_capture(tmp_path, capsys):
+def test_boards_and_sweeps_grow_in_one_capture(tmp_path, capsys, rig):
     out = f"out={tmp_path}/session"
-    board = ["record", "part=board", "patterns=paper_calibration", "cameras=[cam1,cam2]", "count=1", *QUIET, out]
+    quiet = (*QUIET, *half_as_fields(rig))
+    board = ["record", "part=board", "patterns=paper_calibration", "cameras=[cam1,cam2]", "count=1", *quiet, out]
     assert cli.main(board) == 0 and cli.main([*board, "seed=1"]) == 0
-    assert cli.main(["record", "part=sweep", "name=scan", "purpose=volume", *STROKE, *QUIET, out]) == 0
+    assert cli.main(["record", "part=sweep", "name=scan", "purpose=volume", *STROKE, *quiet, out]) == 0
     captured = read_board(tmp_path / "session")
     assert captured.poses == ("00", "01") and set(captured.pose(1).lit) == {"cam1", "cam2"}
     read = read_manifest(tmp_path / "session")
     assert set(read.contents["sweep/scan"]) == {"cam1", "cam2", "us"} and read.sweeps["scan"].purpose == "volume"
-    assert cli.main(["record", "part=sweep", "name=scan", *STROKE, *QUIET, out]) == 2
+    assert cli.main(["record", "part=sweep", "name=scan", *STROKE, *quiet, out]) == 2
     assert "give another name=NAME" in capsys.readouterr().err
 
 
