@@ -83,7 +83,7 @@ def run(
     """Kill each command at a number of moments by each signal."""
     jobs = [(killed, number) for killed in KILLED if not only or killed.verb in only for number in SIGNALS]
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda job: _killed(place, *job, moments, seed, command, kill), jobs))
+        return list(pool.map(lambda job: _killed(place, job[0], job[1], moments, seed, command, kill), jobs))
 
 
 def _killed(place: Path, killed: Killed, number: signal.Signals, moments: int, seed: int, command: Run, kill: Kill) -> Tally:
