@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from itertools import count, islice
 from pathlib import Path
 
@@ -52,10 +53,14 @@ def refuses(k: int) -> int:
 
 
 @pytest.fixture(params=["this process", "two processes", pytest.param("dask", marks=pytest.mark.slow)], scope="module")
-def engine(request) -> Engine:
-    if ENGINES[request.param].name == "dask":
-        pytest.importorskip("distributed")
-    return ENGINES[request.param]
+def engine(request) -> Iterator[Engine]:
+    """Dask's workers are there already, as on other machines: the tests below start their own."""
+    if ENGINES[request.param].name != "dask":
+        yield ENGINES[request.param]
+        return
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        yield Engine(name="dask", scheduler=cluster.scheduler_address)
 
 
 def test_every_task_is_done_once_and_processes_are_replaced_after_their_share(engine):
