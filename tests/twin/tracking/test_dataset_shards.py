@@ -92,12 +92,10 @@ def test_a_sample_does_not_know_its_batch(made, monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["local", "dask"])
-def test_two_workers_write_the_same_bytes(made, tmp_path, name):
-    if name == "dask":
-        pytest.importorskip("distributed")
+def test_two_workers_write_the_same_bytes(made, tmp_path):
+    """By whichever engine: all of them do tasks alike."""
     place = Place(tmp_path / "set")
-    list(generate(place, settings(), prepare(place, settings()), Engine(name=name, workers=2)))
+    list(generate(place, settings(), prepare(place, settings()), Engine(workers=2)))
     for number in (0, 1):
         assert place.shard(number).read_bytes() == made.shard(number).read_bytes()
 
