@@ -71,13 +71,13 @@ def test_frames_are_the_images_served(tmp_path, rng, opened):
 
 
 @pytest.mark.slow
-def test_a_thousand_pairs_arrive_without_loss(tmp_path, rng, opened):
+def test_hundreds_of_pairs_arrive_without_loss(tmp_path, rng, opened):
     """Two free-running cameras, 1280x1024, at the emulator's rate; where cores are short, one runs ahead by tens of frames."""
-    first, hashes1 = serve(tmp_path / "first", 7, (1280, 1024), rng, held=1000)
-    second, hashes2 = serve(tmp_path / "second", 11, (1280, 1024), rng, held=1000)
+    first, hashes1 = serve(tmp_path / "first", 7, (1280, 1024), rng, held=250)
+    second, hashes2 = serve(tmp_path / "second", 11, (1280, 1024), rng, held=250)
     pair = CameraPair((opened(first), opened(second, SERIALS[1], "cam2")))
     pair.start("free")
-    for k in range(1000):
+    for k in range(250):
         one = pair.pair(30.0)
         assert (one.number, one.lost) == (k, ())
         assert [digest(frame.image) for frame in one.frames] == [hashes1[k % 7], hashes2[k % 11]]
