@@ -18,7 +18,7 @@ FEW = {
     "seeds": 1,
     "first_seed": 3,
     "rig": half(choices.read_rig(study_accuracy.RIG)),
-    "tracing": Tracing(samples=4, room_lux=20),
+    "tracing": Tracing(samples=8, room_lux=20),
 }
 POSES = choices.read("poses", "paper")
 
@@ -36,15 +36,12 @@ def _in_this_process(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["planes", "sphere"])
 def test_ours_keeps_its_bars_where_the_papers_method_is_farther_off(kept, name):
-    """Under lifelike conditions; where noise limits a figure, ours is within a third of that: few rays leave noise of their own.
-
-    The paper's method comes to twice the limit.
-    """
+    """Under lifelike conditions; where noise limits a figure, ours is within a fourth of that, the paper's at twice the limit."""
     config, done = study_accuracy.study(kept, name, **FEW, poses=POSES | {"count": 8})
     compared = beside_paper.compare(config.beside, done)
     assert len(compared) == len(config.beside) and all(one.bar_met for one in compared)
     assert all(one.paper.max() > one.ours.max() for one in compared)
-    assert all(one.ours.max() < 1.33 * one.limit for one in compared if one.figure.limit)
+    assert all(one.ours.max() < 1.25 * one.limit for one in compared if one.figure.limit)
     assert len(list((kept / "trials").glob("*.json"))) == 1  # planes and sphere are figures of the same laboratory
 
 
