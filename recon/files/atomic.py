@@ -308,7 +308,7 @@ def check_folder(path: Path, by: str, inputs: Iterable[Path | None] = (), adds: 
 
 
 def check_filled_folder(path: Path, by: str, inputs: Iterable[Path | None] = ()) -> None:
-    """The same of a folder that is filled where it stands, not replaced: of one that is there the parent needn't be writable."""
+    """As `check_folder`, for a folder that is filled in place: if it is there, its parent needn't be writable."""
     path = _checked(path, by, inputs)
     _check_writable(path, path)
 

@@ -67,10 +67,10 @@ def sought_again(
     target: Target,
     optics: Uncertainty | None = None,
 ) -> Iterator[list[list[Outlines]]]:
-    """Rims of both views, of which some count, and the others are found again where these ask for them.
+    """Refit the remaining rims at the positions that the trusted rims of both views predict.
 
-    Each selection of those of which but a part is seen is tried, under each naming by which whole ellipses are those of one pose.
-    Step by step fewer count; what was found with equally many comes in one list.
+    Whole rims are trusted, and each selection of the partly seen ones, under each naming whose whole ellipses fit one pose.
+    Results with equally many trusted rims come in one list, most first.
     """
     for _, choices in groupby(_counted(pair), key=_number):
         yield [
@@ -84,26 +84,26 @@ def sought_again(
 def _completed_by(
     pose: TargetPose, pair: Sequence[Outlines], frames: Sequence[NDArray], cameras: Sequence[Camera], target: Target
 ) -> list[Outlines]:
-    """Rims of both views with those that are missing fitted where a pose has them."""
+    """Fit the missing rims of both views at the positions that a pose predicts."""
     return [_sought(frame, rims, camera, pose, target) for frame, rims, camera in zip(frames, pair, cameras, strict=True)]
 
 
 def _are_whole(
     pair: Sequence[Outlines], pose: TargetPose, cameras: Sequence[Camera], target: Target, optics: Uncertainty | None
 ) -> bool:
-    """Whether rims are three of one view and two of the other, and whole ellipses those of a pose near one."""
+    """Whether there are three rims in one view and two in the other, whose whole ellipses fit a pose near the given one."""
     return _number(pair) >= ENOUGH and refined(pose.world_from_target, _whole(pair, cameras), target, optics).found
 
 
 def _number(pair: Sequence[Outlines]) -> int:
-    """Of rims that both views show."""
+    """Number of rims in both views."""
     return int(sum(outlines.found.sum() for outlines in pair))
 
 
 def _counted(pair: Sequence[Outlines]) -> list[list[Outlines]]:
-    """Choices of the rims that count, most first: those of which the whole is seen, and each selection of the others.
+    """Choices of trusted rims, most first: the whole ones, with each selection of the partly seen ones.
 
-    All selections of as many rims are tried or none, so that a rival of what is found isn't missed.
+    All selections of equally many rims are tried, or none, so that no rival of the result is missed.
     """
     choices = [list(choice) for choice in product(*(list(_fewer(outlines)) for outlines in pair))]
     several = sorted(
@@ -116,7 +116,7 @@ def _counted(pair: Sequence[Outlines]) -> list[list[Outlines]]:
 
 
 def _fewer(outlines: Outlines) -> Iterator[Outlines]:
-    """The rims of a view, and the same without some of which but a part is seen; one is left at least."""
+    """The rims of a view, and each selection without some of the partly seen ones; at least one is left."""
     covered = np.flatnonzero(outlines.found & (outlines.seen < WHOLE))
     for kept in product((True, False), repeat=len(covered)):
         fewer = outlines.without(covered[~np.array(kept, bool)])
@@ -127,7 +127,7 @@ def _fewer(outlines: Outlines) -> Iterator[Outlines]:
 def named_poses(
     pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target, optics: Uncertainty | None = None
 ) -> Iterator[tuple[list[Outlines], TargetPose]]:
-    """Poses by two or three circles of each view, with the rims in the order of the names under which they are such.
+    """Poses from two or three circles of each view, each with the rims in the order of the names that give it.
 
     By themselves two circles have no order, so mostly there are two poses of two circles a view, half a turn apart.
     """
@@ -144,7 +144,7 @@ def named_poses(
 
 
 def _starts(pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target) -> list[Array]:
-    """Poses that one view allows, that with more circles."""
+    """Poses that fit the view with more circles."""
     k = int(np.argmax([outlines.found.sum() for outlines in pair]))
     centres, found = pair[k].rings.centre.copy(), pair[k].found
     if found.sum() == POINTS - 1:
@@ -154,14 +154,14 @@ def _starts(pair: Sequence[Outlines], cameras: Sequence[Camera], target: Target)
 
 
 def _meeting(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> bool:
-    """Whether the rays of circles that both views show meet."""
+    """Whether the rays through circles that both views show meet."""
     both = pair[0].found & pair[1].found
     points, gaps = meet(cameras, [outlines.ellipses.centre[both] for outlines in pair])
     return bool(np.isfinite(points).all() and (np.abs(gaps) < APART_MM).all())
 
 
 def _whole(pair: Sequence[Outlines], cameras: Sequence[Camera]) -> list[Sighting]:
-    """Sightings of which whole ellipses count."""
+    """Sightings by whole ellipses."""
     return [outlines.sighting(camera).by_shapes() for outlines, camera in zip(pair, cameras, strict=True)]
 
 
@@ -183,7 +183,7 @@ def exchanged(found: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _sought(image: NDArray, outlines: Outlines, camera: Camera, pose: TargetPose, target: Target) -> Outlines:
-    """The rims of an image; those missing are sought again where a pose has them, hidden middle or not."""
+    """The rims of an image, with the missing ones fitted where a pose predicts them, even if their middles are hidden."""
     expected = Ellipses(*ellipses_of(camera, pose.world_from_target, *circles(target)))
     sigma = _place_sigma(camera, pose, target)
     for which in np.flatnonzero(~outlines.found):
@@ -196,14 +196,14 @@ def _sought(image: NDArray, outlines: Outlines, camera: Camera, pose: TargetPose
 
 
 def _place_sigma(camera: Camera, pose: TargetPose, target: Target) -> Array:
-    """Standard deviations : (n,) px, along the worse axis, of where a pose has the circles."""
+    """Standard deviations : (n,) px, along the worse axis, of the circles' positions by a pose."""
     centres, place = circle_centres(target), pose.world_from_target
     slopes = slopes_at(camera, rigid.apply(place, centres)) @ rigid.slopes(rigid.rotate(place, centres))
     return np.sqrt(np.linalg.eigvalsh(slopes @ pose.total @ np.swapaxes(slopes, 1, 2))[:, -1])
 
 
 def named_and_completed(image: NDArray, outlines: Outlines, target: Target) -> Outlines:
-    """The rims of an image, as `completed`, where names aren't sure: two that are found may be others, or exchanged."""
+    """As `completed`, where names are unsure: two rims may have other names, or exchanged ones."""
     named = by_distance(outlines, target)
     whole = completed(image, named, target)
     if whole.found.sum() != POINTS - 1:
@@ -213,7 +213,7 @@ def named_and_completed(image: NDArray, outlines: Outlines, target: Target) -> O
 
 
 def by_distance(outlines: Outlines, target: Target) -> Outlines:
-    """The rims of an image, of which two are found: in other names, if those that they have ask for another distance."""
+    """Rename the only two rims of an image if the target's circles of their names are another distance apart."""
     found = np.flatnonzero(outlines.found)
     if len(found) != POINTS - 1:
         return outlines
@@ -229,18 +229,18 @@ def by_distance(outlines: Outlines, target: Target) -> Outlines:
 
 
 def _log_stretch(two: Ellipses, names: tuple[int, int], target: Target) -> float:
-    """Logarithm of the distance of two discs, by their sizes and tilts, over that of the circles of two names."""
+    """Logarithm of the distance between two discs, measured by their sizes and tilts, over that of the circles of two names."""
     first, second = circle_centres(target)[names, :2]
     return float(np.log(np.linalg.norm(_untilted(two, target)) / np.linalg.norm(second - first)))
 
 
 def _untilted(two: Ellipses, target: Target) -> Array:
-    """The way : (2,) mm from one disc to another on the target, but for a turn, by their mean shape."""
+    """Vector : (2,) mm on the target from one disc to another, up to a turn, by their mean shape."""
     return np.linalg.solve(two.shape.mean(axis=0) * 2 / target.outer_diameter_mm, two.centre[1] - two.centre[0])
 
 
 def further(ellipses: Ellipses, found: NDArray[np.bool_], which: int, target: Target) -> Ellipses:
-    """The ellipse, one, of circle number `which`, from those of `found` : (n,), two or more.
+    """Predict the ellipse of circle number `which` from two or more others, `found` : (n,).
 
     NaN if they are two of another distance than the target's.
     """
@@ -263,7 +263,7 @@ def further(ellipses: Ellipses, found: NDArray[np.bool_], which: int, target: Ta
 
 
 def alike(again: Outlines, outlines: Outlines) -> bool:
-    """Whether a rim, one, is a ring as those that are found are: of ink as dark, and with a middle that isn't ink.
+    """Whether a single rim is a ring like those found: its ink as dark, its middle free of ink.
 
     A middle that something hides tells nothing else, and a fingertip beside the target, which is round too, must not pass.
     """
@@ -274,5 +274,5 @@ def alike(again: Outlines, outlines: Outlines) -> bool:
 
 
 def _as_dark(again: Outlines, outlines: Outlines) -> bool:
-    """Whether the ink of a rim, one, is as dark as that of those that are found."""
+    """Whether the ink of a single rim is as dark as that of those found."""
     return bool(again.depth[0] > STEEP * outlines.depth[outlines.found].min())

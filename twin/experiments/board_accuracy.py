@@ -21,7 +21,7 @@ from twin.optics.surface_session import calibration_of
 
 Array = NDArray[np.float64]
 
-SEEDS = range(700, 740)  # of boards that nothing was tried on
+SEEDS = range(700, 740)  # unseen seeds of boards
 BOWS_MM = (0.0, 0.02, 0.1, 0.5)  # largest distance from the plane
 PRINTS_MM = (0.0, 0.02, 0.1)  # standard deviation of each dot along x and y
 POSES = (12, 20, 34)

@@ -26,7 +26,7 @@ from twin.experiments.experiment_setup import Figures, Setup
 
 Array = NDArray[np.float64]
 
-SEEDS = range(1000, 1200)  # of point sets that nothing was tried on
+SEEDS = range(1000, 1200)  # unseen seeds of point sets
 BOARD = AsymmetricCircles(columns=4, rows=11, spacing_mm=8, diameter_mm=5)
 SIZE, FOCAL_PX = (1280, 1024), (1000.0, 3400.0)
 NOISE_PX = 0.02

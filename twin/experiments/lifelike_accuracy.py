@@ -31,7 +31,7 @@ from twin.working_range import working_range
 
 Array = NDArray[np.float64]
 
-SEEDS = range(300, 310)  # of laboratories that nothing was tried on
+SEEDS = range(300, 310)  # unseen seeds of laboratories
 COUNT = 12  # poses of the board
 DEVICES = ("cam1", "cam2", "projector")
 

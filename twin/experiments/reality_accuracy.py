@@ -15,7 +15,7 @@ from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.surface_accuracy import experiment
 from twin.optics.surface_session import Shooting
 
-SEEDS = range(100, 110)  # of conditions that nothing was tried on
+SEEDS = range(100, 110)  # unseen seeds of conditions
 EXPOSURES_S = (2e-4, 5e-4, 1e-3, 1.4e-3, 2e-3, 4e-3, 8e-3, 1.6e-2)
 FEWEST = 2000  # points whose spread is known to 5 %, though neighbours share theirs
 COVERED, SAMPLES = range(1083, 1093), 100  # seeds of frames as in a data set, each of its own bodies, and pairs of each

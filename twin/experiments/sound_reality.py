@@ -17,7 +17,7 @@ from twin.experiments.experiment_setup import Figures, Setup
 
 Array = NDArray[np.float64]
 
-DRAWS = range(300, 310)  # seeds of each block's errors, that nothing was tried on
+DRAWS = range(300, 310)  # unseen seeds of each block's errors
 KINDS = {"nothing": None, "probe_percent": movement.PROBE, "wires_percent": movement.WIRES}
 WATER_C, TISSUE = 1.0, 0.02  # standard deviations of the water's temperature, and of the tissue's speed over that assumed
 

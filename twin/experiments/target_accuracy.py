@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Shown = tuple[Take, Frames]
 
 SEED, COUNT, RAYS = 3003, 40, 32  # of the frames, which show the target to be measured
-PRINTS = range(200, 210)  # seeds of designs that nothing was tried on
+PRINTS = range(200, 210)  # unseen seeds of designs
 ERROR_MM = 0.3  # by which each circle's place is off at most, to all sides alike
 UNSEEN, SAMPLES = (1051, 1061), 250  # seeds of frames as in a data set, and pairs of each
 DESIGNS = 4  # that each of them is tracked with
