@@ -55,11 +55,14 @@ class FusedScene:
 
     @property
     def path(self) -> Array:
-        """Pieces : (m, 2, 3) mm of the way of the array's face, its middle, between B-scans in a row that both have a pose."""
+        """Pieces : (m, 2, 3) mm of the way of the array's face, its middle, between B-scans in a row that both have a pose.
+
+        Where the probe rests there is no piece.
+        """
         face_row = 0.0 if self.scans.probe is None else self.scans.probe.face_row
         middles = _faces_middle(self.scans.world_from_pixel, self.scans.shape[1], face_row)
         pieces = np.stack([middles[:-1], middles[1:]], axis=1)
-        return pieces[np.isfinite(pieces).all(axis=(1, 2))]
+        return pieces[np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1) > 1e-6]  # not so of NaN
 
 
 def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
@@ -102,10 +105,9 @@ def _scan_corners(width: int, height: int, world_from_pixel: Array) -> Array:
 
 
 def path_layer(ends: Array) -> trimesh.Trimesh:
-    """A tube along pieces between ends : (n, 2, 3) mm, n >= 1; where both coincide there is no piece."""
-    moved = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > 1e-6
+    """A tube along pieces between ends : (n, 2, 3) mm, n >= 1, that don't coincide."""
     path_mm = 0.6  # radius of the path's tube
-    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends[moved]]
+    pieces = [trimesh.creation.cylinder(path_mm, segment=both, sections=6) for both in ends]
     whole = trimesh.util.concatenate(pieces)
     assert isinstance(whole, trimesh.Trimesh)
     return painted(whole, IN_SPACE.path)

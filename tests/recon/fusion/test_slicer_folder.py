@@ -16,7 +16,7 @@ from recon.files import volumes
 from recon.files.volumes import Volume
 from recon.freehand import sequences
 from recon.freehand.scans import Scans
-from recon.fusion import probe_shape, scene_page, slicer_folder
+from recon.fusion import fused_scene, probe_shape, scene_page, slicer_folder
 from recon.fusion.fused_scene import FusedScene
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
@@ -87,6 +87,15 @@ def test_the_path_does_not_cross_gaps_and_begins_at_the_face(scene):
     housings = [probe_shape.of(scene.target, probe, 30)[0] for probe in (scene.scans.probe, lower.probe)]
     moved = housings[1].vertices[8:16] - housings[0].vertices[8:16]
     assert moved == pytest.approx(np.tile(10 * lower.probe.scale[1] * lower.probe.target_from_image[:3, 1], (8, 1)))
+
+
+def test_a_probe_at_rest_has_no_path(scene):
+    """Nor has a scene of it a layer for one; a rest amid a sweep leaves the path before and after it."""
+    resting = scene.scans.world_from_pixel.copy()
+    resting[1] = resting[0]
+    assert len(replace(scene, scans=replace(scene.scans, world_from_pixel=resting)).path) == len(scene.path) - 1
+    still = replace(scene, scans=replace(scene.scans, world_from_pixel=np.repeat(resting[:1], len(resting), axis=0)))
+    assert len(still.path) == 0 and "path" not in fused_scene.layers(still, 1)
 
 
 def test_markups_lie_in_the_masses_and_hold_their_uncertainty(folder, scene):
