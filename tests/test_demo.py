@@ -1,8 +1,6 @@
 """The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
 
-import contextlib
 import html
-import io
 import json
 import os
 import re
@@ -98,21 +96,19 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
         assert parts[name].ultrasound.image_size == (161, 272)
 
 
-@pytest.fixture(scope="module")
-def demonstrated(tmp_path_factory) -> tuple[Config, list[str]]:
-    """The demonstration without errors of the laboratory: its settings, and the lines that it printed."""
-    folder = tmp_path_factory.mktemp("demonstrated")
-    fields = ["conditions=ideal", f"out={folder / 'demo'}", f"board={folder / 'board'}"]
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        assert main(["demo", *fields]) == 0
-    return load("demo", fields, Config), printed.getvalue().splitlines()
-
-
 @pytest.mark.slow
-def test_the_demonstration_is_as_good_as_the_noise_allows(demonstrated):
-    """Outside, inside, and the report of both."""
-    out, printed = demonstrated[0].out, demonstrated[1]
+def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
+    """Without errors of the laboratory: outside, inside, and the report of both; steps that are lost come back the same."""
+    fields = ["conditions=ideal", f"out={tmp_path / 'demo'}", f"board={tmp_path / 'board'}"]
+    assert main(["demo", *fields]) == 0
+    demonstrated = load("demo", fields, Config)
+    check_figures(demonstrated.out, capsys.readouterr().out.splitlines())
+    check_motion_of_frames(demonstrated)
+    check_lost_steps(demonstrated, capsys)
+
+
+def check_figures(out: Path, printed: list[str]) -> None:
+    """What was measured against the truth, the lines that say so, and the report."""
     assert not [name for name in (*MADE, *MADE_INSIDE) if not (out / name).is_file()]
     metrics = figures(out)
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
@@ -148,10 +144,20 @@ def test_the_demonstration_is_as_good_as_the_noise_allows(demonstrated):
     assert off.max() < 0.6 and (off < 4 * sigma).all()
 
 
-@pytest.mark.slow
-def test_lost_steps_come_back_to_the_same_bytes_without_the_truth(demonstrated, capsys):
-    """With those that build on them, but for the seconds in metrics.json and its digest in the list. No other is done again."""
-    config, _ = demonstrated
+def check_motion_of_frames(config: Config) -> None:
+    """By their truth the board moves over an exposure as fast as from frame to frame, and is seen whole in most of them."""
+    with np.load(config.out / "truth" / "sweep" / "scan" / "film.npz") as film:
+        places, speed = film["world_from_target"][:, :3, 3], film["shift_mm"] / 0.01
+    between = (places[2:] - places[:-2]) * config.clocks.camera_hz / 2
+    assert np.median(np.linalg.norm(speed[1:-1] - between, axis=1)) < 0.1 * np.median(np.linalg.norm(between, axis=1))
+    assert track_errors.visible_whole(track_errors.read_truth(config.out / "truth", "scan")).mean() > 0.9
+
+
+def check_lost_steps(config: Config, capsys) -> None:
+    """They and those that build on them come back to the same bytes, while the truth is away; no other step is done again.
+
+    But for the seconds in metrics.json, and its digest in the list.
+    """
     result = config.out / "result"
 
     def contents() -> dict[str, bytes]:
@@ -169,17 +175,6 @@ def test_lost_steps_come_back_to_the_same_bytes_without_the_truth(demonstrated, 
     said = capsys.readouterr().out
     assert all(f"kept        {name}" in said for name in ("optics", "poses/scan", "poses/bottom"))
     assert contents() == before
-
-
-@pytest.mark.slow
-def test_the_truth_of_the_frames_is_the_paths(demonstrated):
-    """The board moves over an exposure as fast as from frame to frame, and is seen whole in most of them."""
-    config, _ = demonstrated
-    with np.load(config.out / "truth" / "sweep" / "scan" / "film.npz") as film:
-        places, speed = film["world_from_target"][:, :3, 3], film["shift_mm"] / 0.01
-    between = (places[2:] - places[:-2]) * config.clocks.camera_hz / 2
-    assert np.median(np.linalg.norm(speed[1:-1] - between, axis=1)) < 0.1 * np.median(np.linalg.norm(between, axis=1))
-    assert track_errors.visible_whole(track_errors.read_truth(config.out / "truth", "scan")).mean() > 0.9
 
 
 def silent(_):
