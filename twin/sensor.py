@@ -70,7 +70,8 @@ def auto_exposure(
     brightest, peak = 0.0, 0.0
     for image in radiance:
         brightest = max(brightest, float(np.percentile(image[::4, ::4], percentile)))
-        peak = max(peak, float(image.max()))
+        if not brightest:
+            peak = max(peak, float(image.max()))
     brightest = brightest or peak
     if brightest <= 0:
         return 1.0
