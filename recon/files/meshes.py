@@ -3,7 +3,7 @@
 import io
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,22 @@ def greys_of(mesh: trimesh.Trimesh) -> NDArray[np.uint8] | None:
 def set_greys(mesh: trimesh.Trimesh, greys: NDArray[np.uint8]) -> None:
     """Give the vertices grey levels : (n,)."""
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.column_stack([greys, greys, greys, np.full_like(greys, 255)]))
+
+
+def joined(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """One mesh of several, with their normals, and the vertex attributes and grey levels that all of them have."""
+    if len(parts) == 1:
+        return parts[0]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
+    places, normals = (np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "vertex_normals"))
+    whole = trimesh.Trimesh(places, faces, vertex_normals=normals, process=False, validate=False)
+    for name in set.intersection(*(set(part.vertex_attributes) for part in parts)):
+        whole.vertex_attributes[name] = np.concatenate([part.vertex_attributes[name] for part in parts])
+    greys = [greys_of(part) for part in parts]
+    if len(shown := [grey for grey in greys if grey is not None]) == len(parts):
+        set_greys(whole, np.concatenate(shown))
+    return whole
 
 
 def read_ply(path: Path, expected: str) -> trimesh.Trimesh:

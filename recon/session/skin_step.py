@@ -1,9 +1,9 @@
 """The surface by fringes in the view of a camera and the projector: the settings of the step, the step, and its files."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,8 +21,9 @@ from recon.model.patterns import Patterns
 from recon.model.rig import Part
 from recon.registry import Choice
 from recon.session.watch import SILENT, Watch
-from recon.structured_light import decode, ray_checks, surface_figures, surface_mesh
+from recon.structured_light import decode, ray_checks, second_view, surface_figures, surface_mesh
 from recon.structured_light.decode import ProjectorMap
+from recon.structured_light.second_view import Fused, View
 from recon.structured_light.surface_mesh import Limits
 from recon.structured_light.triangulate import PointMap, Triangulator
 
@@ -87,7 +88,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     clock = Stopwatch()
     with clock.stage("read"):
         shots = read(settings)
-    skin = reconstruct(shots, settings.camera, settings.limits, settings.implausible, beside(settings), watch, clock)
+    skin = reconstruct(shots, settings.camera, settings.limits, settings.implausible, cameras_beside(settings), watch, clock)
     with atomic.new_folder(out, BY) as folder:
         with clock.stage("write"):
             meshes.write_ply(folder / SKIN, skin.mesh)
@@ -130,10 +131,15 @@ def reconstruct(
     with clock.stage("triangulate"):
         raw = triangulate(found, implausible)
         ray_checks.check(found, raw, by, projector, shots.name, implausible)
-    with clock.stage("second_view"):  # the demo has a step of the name "compare"
-        for line in compared(shots, others or {}, found, raw, implausible):
-            watch.say(line)
+    with clock.stage("second_view"):
+        views = list(beside(shots, others or {}, found, raw, implausible, watch))
+        joined = [second_view.fuse(View(by, found, raw), view, projector) for view in views]
+        for view, fused in zip(views, joined, strict=True):
+            raw = fused.points
+            watch.say(describe_fusion(view, fused))
     skin = surface_of(found, raw, by, limits, shots.name, clock)
+    with clock.stage("seen_alone"):
+        skin = with_more(skin, by, [view for view, fused in zip(views, joined, strict=True) if fused.shared.any()], limits)
     figures = skin.figures
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     watch.say(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
@@ -166,14 +172,15 @@ def surface_of(
     return Skin(found, cleaned, mesh, surface_figures.measure(found, raw, cleaned) | predicted)
 
 
-def compared(
+def beside(
     shots: SurfaceCapture,
     others: Mapping[str, Callable[[], SurfaceCapture]],
     found: ProjectorMap,
     raw: PointMap,
     implausible: Implausible,
-) -> Iterator[str]:
-    """Lines: the share of the points that other cameras see alike, or why one can't be compared.
+    watch: Watch = SILENT,
+) -> Iterator[View]:
+    """Other cameras' views of the same fringes; says what share of the points each sees alike, or why it is left out.
 
     Raises
     ------
@@ -182,20 +189,47 @@ def compared(
     """
     for name, read_its in others.items():
         if name not in shots.calibration.cameras:
-            yield f"compare     {name} isn't compared: it has no calibration"
+            watch.say(f"compare     {name} isn't compared: it has no calibration")
             continue
         try:
             its = read_its()
             other = decode.decode(its.images, its.patterns, bits=its.bits, name=f"{its.name}: {name}", camera=name)
         except InputError as fault:
-            yield f"compare     {name} isn't compared: {fault}"
+            watch.say(f"compare     {name} isn't compared: {fault}")
             continue
-        alike = ray_checks.check_beside(found, raw, other, its.calibration.cameras[name], shots.name, implausible)
+        camera = its.calibration.cameras[name]
+        alike = ray_checks.check_beside(found, raw, other, camera, shots.name, implausible)
         if np.isfinite(alike):
-            yield f"compare     {name} sees {100 * alike:.0f} % of the points alike"
+            watch.say(f"compare     {name} sees {100 * alike:.0f} % of the points alike")
+            yield View(camera, other, Triangulator(camera, its.calibration.cameras["projector"])(other, implausible))
 
 
-def beside(settings: Settings) -> dict[str, Callable[[], SurfaceCapture]]:
+def describe_fusion(view: View, fused: Fused) -> str:
+    """A line: the points that another camera improves, or why it improves none."""
+    if fused.shared.any():
+        both, apart = (f"{np.count_nonzero(mask):,}".replace(",", " ") for mask in (fused.shared, fused.apart))
+        return f"fuse        {view.camera.name} measures {both} points, too; {apart} left out, on which both disagree"
+    if np.isnan(fused.bias_px):
+        return f"fuse        {view.camera.name} improves no point: both cameras see too few alike"
+    cause = "devices that drifted since their calibration? sonotwin correct-optics corrects it"
+    parts = f"the calibration parts both by {fused.bias_px:.2f} projector px"
+    return f"warning     {view.camera.name} improves no point: {parts}: {cause}"
+
+
+def with_more(skin: Skin, camera: Camera, views: Sequence[View], limits: Limits) -> Skin:
+    """A skin with what other cameras see of it beside the first one's points."""
+    meshes_of = [skin.mesh]
+    for view in views:
+        more = surface_mesh.clean(view.raw, view.camera, view.found.modulation, limits)
+        more = second_view.alone(View(view.camera, view.found, more), skin.points, camera)
+        if np.isfinite(more.points).any():
+            meshes_of.append(surface_mesh.mesh(more, view.camera, limits.max_slope, view.found.offset))
+    mesh = meshes.joined(meshes_of)
+    more = {"points_added": len(mesh.vertices) - len(skin.mesh.vertices), "triangles": len(mesh.faces)}
+    return replace(skin, mesh=mesh, figures=skin.figures | more)
+
+
+def cameras_beside(settings: Settings) -> dict[str, Callable[[], SurfaceCapture]]:
     """The capture's other cameras that took the sequence, with what reads their images."""
     if settings.capture is None:
         return {}
