@@ -110,6 +110,8 @@ COMMANDS = (
             (*_film("film"), "target/target.yaml")),
     Command("check", ("capture=both/capture", "alarm_sigma=20"), ("both",),
             ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
+    Command("correct-optics", ("capture=both/capture",), ("both",),
+            ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
     Command("check", ("capture=bottom/capture", "probe=probe/probe.yaml", "lag=lag/lag.json", "log=rig.jsonl"),
             ("bottom", "probe", "lag", "rig.jsonl"), (*_sweep("bottom"), "probe/probe.yaml", "lag/lag.json", "rig.jsonl")),
     Command("navigate", ("capture=filmed/capture", "skin=bent.ply", "masses=lump", "seconds=1", "view.port=0",

@@ -50,6 +50,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
     Verb("measure-lag", "measure the lag of the scanner's images behind the tracked poses"),
     Verb("check", "check whether the rig is still as it was calibrated, before a session"),
+    Verb("correct-optics", "correct a calibration for drift since, by a session's own images"),
     Verb("surface", "reconstruct the surface from a capture, rendered or real"),
     Verb("track", "track the probe's target through the frames of two cameras"),
     Verb("freehand", "put tracked B-scans into a volume, for 3D Slicer too"),

@@ -22,7 +22,6 @@ from sonotwin.rendered_session import BOTTOM, SCAN, WATER_C, WIRES, Rendering
 from sonotwin.verbs import evaluate, film, reconstruct, render, track
 from twin import board_session
 from twin.evaluation import session_errors, sweep_errors, track_errors
-from twin.optics.surface_session import CameraName
 from twin.reports import demo_report, sweep_report, track_report
 from twin.session import CAPTURE, TRUTH
 
@@ -44,6 +43,7 @@ FILES = {  # in the folder: what is in them
     "demo.json": "every setting",
 }
 FROM_BOARD = {"result/optics/calibration.html": "the calibration that all was measured with, and how far it can be trusted"}
+FROM_BOTH = {"result/drift/drift.html": "what drifted since the calibration, and what it would have cost"}
 FROM_SWEEPS = {
     f"result/scene/{SCAN}/scene.html": "all of it in one view that one can turn, with the probe and its B-scan along the sweep",
     f"result/scene/{SCAN}/scene.glb, slicer/": "the same as layers for any viewer, and a folder for 3D Slicer",
@@ -60,9 +60,8 @@ FROM_FILM = {
 
 
 class Config(rendered_session.Settings):
-    """Fields of `conf/demo.yaml`: those of a session, with one camera for the scene."""
+    """Fields of `conf/demo.yaml`: those of a session."""
 
-    cameras: Annotated[list[CameraName], Field(min_length=1, max_length=1)]
     board: Path
     tissue_m_s: Speed = 1450.0
     film_frames: Annotated[int, Field(ge=0, le=10_000)] = 24
@@ -175,6 +174,8 @@ def compare(config: Config) -> Metrics:
     if config.poses is not None:
         found = calibration_files.read(result / "optics" / optics_step.OPTICS)
         figures |= metrics.read(result / "optics" / metrics.FILE) | session_errors.optics(found, truth)
+    if (result / "drift" / metrics.FILE).is_file():
+        figures |= _named(result / "drift", "drift")
     figures |= metrics.read(result / "surface" / metrics.FILE)
     # what evaluation predicts, in place of the surface's own, is of points that have a truth, by true normals
     figures |= metrics.read(config.out / EVALUATION / metrics.FILE)
@@ -196,10 +197,11 @@ def track_film(settings: track.Config) -> Metrics:
 def report(config: Config, found: Figures) -> None:
     """Write the report of all steps."""
     out, result, truth = config.out, config.out / RESULT, config.out / TRUTH
-    optics = result / "optics" / optics_step.OPTICS if config.poses is not None else None
+    optics = plan.optics_used(result)
     estimated = None if optics is None else calibration_files.read(optics)
     story = demo_report.read(out / CAPTURE, truth, result / "surface" / skin_step.POINTS, config.cameras[0], estimated)
-    files, inside, tracked, fused = FILES | (FROM_BOARD if optics else {}), None, None, None
+    files, inside, tracked, fused = FILES | (FROM_BOARD if config.poses is not None else {}), None, None, None
+    files |= FROM_BOTH if (result / "drift").is_dir() else {}
     if config.looks_inside:
         files |= FROM_SWEEPS
         expected = sweep_errors.read_truth(truth, SCAN)

@@ -101,7 +101,7 @@ def settings(conditions: str, seed: int) -> Settings:
     """A session's settings, which no default of the demonstration's changes; as many poses as in Meza et al. 2021."""
     groups = {"rig": RIG, "scene": "breast", "patterns": "paper_surface", "tracing": "default", "poses": POSES, "path": "raster"}
     groups |= {"ultrasound": "linear", "conditions": conditions}
-    own = {"cameras": ["cam1"], "shooting": {}, "clocks": Clocks(), "seed": seed, "out": "session"}
+    own = {"cameras": ["cam1", "cam2"], "shooting": {}, "clocks": Clocks(), "seed": seed, "out": "session"}
     longer = {"wires": 40, "bottom_s": 6.0, "board_samples": None}
     return Settings.model_validate({group: choices.read(group, name) for group, name in groups.items()} | own | longer)
 

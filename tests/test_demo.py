@@ -79,7 +79,7 @@ def test_a_small_demonstration_runs_through(tmp_path, capsys):
     assert max(metrics[f"reprojection_rms_{name}_px"] for name in ("cam1", "cam2", "projector")) < 0.05
     printed = capsys.readouterr().out.splitlines()
     wrote = [re.fullmatch(r"wrote +(.*)/\{(.*)\}", line) for line in printed if line.startswith("wrote")]
-    assert len(wrote) == 6  # two renders, three steps of the reconstruction, and the evaluation
+    assert len(wrote) == 7  # two renders, four steps of the reconstruction, and the evaluation
     assert all((Path(folder) / name).exists() for folder, names in (line.groups() for line in wrote) for name in names.split(","))
     assert (out / "surface.ply").read_bytes() == (out / "result" / "surface" / "surface.ply").read_bytes()
     report = html.unescape((out / "report.html").read_text(encoding="utf-8"))

@@ -6,7 +6,7 @@ The cameras share a clock. Frames belong together by their time stamps, whatever
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,10 @@ class Film:
     def rate_hz(self) -> float:
         """Pairs a second; NaN of a single one."""
         return 1e9 / float(np.median(np.diff(self.times))) if len(self.times) > 1 else np.nan
+
+    def some(self, chosen: NDArray[np.intp]) -> "Film":
+        """The film of some of its pairs, by their places."""
+        return replace(self, frames=self.frames[chosen], times=self.times[chosen])
 
     def pairs(self) -> Iterator[Pair]:
         """Read the frames, camera 1's and camera 2's : (h, w), pair by pair; InputError at one that is damaged."""

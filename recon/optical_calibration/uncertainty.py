@@ -85,6 +85,18 @@ def triangulation(
     return _covariances(calibration, _point_slopes(calibration, first, second, points, pixel_sigma))
 
 
+def parting(calibration: Calibration, points: Array, axes: Sequence[int] = (0,)) -> Array:
+    """Derivatives : (m, 3, g) mm of what parts points : (m, 3) mm, as measured by camera 1 and light, from both cameras' own.
+
+    Skin is measured the one way, the probe the other: an error of the frame that both share moves neither against the other.
+
+    axes : of the projector's coordinates that are decoded, 0 of columns and 1 of rows
+    """
+    decoded = np.where(np.isin([0, 1], axes), 1.0, np.inf)
+    by_light = _point_slopes(calibration, "cam1", "projector", points, (1.0, decoded))
+    return by_light - _point_slopes(calibration, "cam1", "cam2", points, (1.0, 1.0))
+
+
 def shape(
     calibration: Calibration,
     first: str,

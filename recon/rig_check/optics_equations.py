@@ -143,13 +143,17 @@ def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: M
 def assemble(
     film: DeviceRows | None, fringes: DeviceRows | None, target: Target, known: Uncertainty, names: Sequence[str]
 ) -> Equations:
-    """All equations with their faults: a motion of each device, and a target of other lengths.
+    """All equations with their faults: a motion of each device, and a target of other lengths."""
+    return _equations(combine(film, fringes, target, known, names), target, known, names)
 
-    Noise that is larger than predicted is taken as found, of film and fringes each by itself.
-    """
+
+def combine(
+    film: DeviceRows | None, fringes: DeviceRows | None, target: Target, known: Uncertainty, names: Sequence[str]
+) -> DeviceRows:
+    """All rows. Noise that is larger than predicted is taken as found, of film and fringes each by itself."""
     parts = [rows for rows in (film, fringes) if rows is not None]
     parts = [rows.over(fault_tests.noise_factor(_equations(rows, target, known, names))) for rows in parts]
-    return _equations(DeviceRows(*map(np.concatenate, zip(*parts, strict=True))), target, known, names)
+    return DeviceRows(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _equations(rows: DeviceRows, target: Target, known: Uncertainty, names: Sequence[str]) -> Equations:

@@ -11,13 +11,14 @@ from pydantic import model_validator
 from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import Implausible, InputError
-from recon.files import atomic, metrics
+from recon.files import atomic, json_text, metrics
 from recon.freehand.scans import TissueFields
 from recon.model.rig import Finite, NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
 from recon.session import (
+    drift_step,
     latency_step,
     masses_step,
     optics_step,
@@ -37,6 +38,7 @@ from recon.tracking import networks
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
 NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
 NO_LAG = "latency failed; give lag_s"
+CAUSE = "what drifted since the calibration, and parts skin and target by a tenth of a millimetre, is corrected"
 Command = Callable[[optics_step.Settings, Path], str]
 
 
@@ -126,9 +128,13 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
     given = (settings.calibration, settings.target, settings.probe, settings.networks)
     check(sources)
     with steps.opened([settings.capture, *given]):
-        optics = calibrate_optics(steps, sources)
+        calibrated = calibrate_optics(steps, sources)
+        optics = correct_optics(steps, sources, calibrated)
         skin = measure_skin(steps, sources, optics)
-        tracked = {name: track_sweep(steps, sources, name, optics) for name in sources.sweeps}
+        drift_px = (
+            settings.drift_px if optics == calibrated else 0.0
+        )  # a corrected calibration has what is left in its covariance
+        tracked = {name: track_sweep(steps, sources, name, optics, drift_px) for name in sources.sweeps}
         lag = measure_latency(steps, sources, tracked)
         probe = calibrate_probe(steps, sources, tracked, lag)
         for name, part in sources.sweeps.items():
@@ -195,6 +201,28 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
     return None if made is None else made / optics_step.OPTICS
 
 
+def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
+    """Correct the calibration for drift by what the session shows of it; returns its file, that of before where it can't be.
+
+    Without fringes before both cameras it isn't: views of the target alone leave most of what parts skin and target.
+    """
+    settings, held = sources.settings, sources.held
+    filmed = [sweep_part(name) for name, part in sources.sweeps.items() if set(CAMERAS) <= part.images.keys()]
+    lit = held.surface is not None and set(CAMERAS) <= held.surface.images.keys()
+    if optics is None or held.surface is None or settings.drift_px == 0:
+        return optics
+    if not lit:
+        steps.leave_out("drift", f"fringes before one camera alone; with those of both {CAUSE}")
+        return optics
+    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks")
+    fields = {field: getattr(settings, field) for field in same} | {"calibration": optics}
+    weights = settings.networks or networks.WEIGHTS
+    made_of = sources.files("surface", *filmed) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
+    does, work = "the calibration, corrected for drift", partial(drift_step.run, watch=sources.watch)
+    made = steps.do("drift", does, drift_step.BY, drift_step.Settings, fields, work, made_of)
+    return optics if made is None else made / drift_step.OPTICS
+
+
 def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
     """Measure the surface by light; returns its file."""
     settings = sources.settings
@@ -214,7 +242,7 @@ def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | 
     return None if made is None else made / skin_step.SKIN
 
 
-def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) -> Path | None:
+def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, drift_px: float) -> Path | None:
     """Track the target in a sweep's frames; returns a capture in which it has poses, the sweep's own where it has a track."""
     settings, part, step = sources.settings, sources.sweeps[name], _step_of("poses", name)
     filmed = set(CAMERAS) <= part.images.keys()
@@ -224,8 +252,9 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None) 
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
-    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
-    fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
+    same = ("rig", "capture", "naming", "board_scale", "target", "networks", "overlays")
+    fields = {field: getattr(settings, field) for field in same}
+    fields |= {"sweep": name, "calibration": optics, "drift_px": drift_px}
     weights = settings.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
@@ -250,6 +279,13 @@ def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path |
     work = partial(latency_step.run, watch=sources.watch)
     made = steps.do("latency", does, latency_step.BY, latency_step.Settings, fields, work, made_of)
     return None if made is None else read_lag(made)
+
+
+def optics_used(out: Path) -> Path | None:
+    """The calibration by which all in a folder of results was measured; None for the capture's own."""
+    done = json_text.read(out / store.RECORD)
+    files = {"drift": drift_step.OPTICS, "optics": optics_step.OPTICS}
+    return next((out / step / file for step, file in files.items() if step in done), None)
 
 
 def read_lag(folder: Path) -> KnownLag:

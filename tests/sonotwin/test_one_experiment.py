@@ -30,7 +30,7 @@ SMALL = [  # a quarter of the size
     "rig.cam1.sensor.pixel_um=19.2",
     "tracing.samples=2",
 ]
-ALONE = ["scene=plane", "patterns=gray_surface", "conditions=ideal", "poses=none", "path=none", "film_frames=0"]
+ALONE = ["scene=plane", "cameras=[cam1]", "patterns=gray_surface", "conditions=ideal", "poses=none", "path=none", "film_frames=0"]
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,9 @@ def lines(metrics: Metrics) -> Iterator[Line]:
     if "point_error_rms_mm" in metrics:
         poses = f"from {metrics['poses']:.0f} poses of the board"
         yield "Cameras and projector", poses, _mm(metrics, "point_sigma_mm"), _mm(metrics, "point_error_rms_mm")
+    if "drift_skin_moved_mm" in metrics:
+        moved = f"{_mm(metrics, 'drift_skin_moved_mm')} between skin and target"
+        yield "Their drift since, corrected", moved, _mm(metrics, "drift_skin_sigma_mm"), ""
     points = f"{page.count(metrics['points'])} points"
     noise = np.hypot(metrics["predicted_rms_mm"], metrics.get("point_sigma_mm", 0.0))  # and the calibration's part
     yield "Surface", points, shown(float(noise), ".3f", " mm"), _mm(metrics, "surface_rms_mm")

@@ -1,0 +1,256 @@
+"""Drift of cameras and projector since their calibration, corrected by what the session shows of it: settings, step and files."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.capture import calibration_files, manifest, stereo_frames, surface_part
+from recon.capture.manifest import CAMERAS, MANIFEST, Manifest
+from recon.errors import InputError
+from recon.estimation.covariance import propagate
+from recon.files import atomic, metrics
+from recon.files.metrics import Metrics
+from recon.geometry.camera_jacobian import difference
+from recon.model.calibration import Calibration
+from recon.optical_calibration import uncertainty
+from recon.reports import page
+from recon.reports.page import Opening, Section
+from recon.rig_check import drift, fringe_matches
+from recon.rig_check.drift import LARGEST, Drift
+from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
+from recon.session import poses_step
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.watch import SILENT, Watch
+from recon.structured_light import decode
+from recon.target_calibration import target_poses
+from recon.tracking.pose_fit import Sighting, meet
+
+BY = "correct-optics"  # who writes
+OPTICS, PAGE = "optics.yaml", "drift.html"
+SEED = 0  # of the points under the fringes
+SHOWN = ("cx", "cy", "fx", "rx", "ry", "rz", "tx", "ty", "tz")  # parameters that a device's drift is told by
+
+Array = NDArray[np.float64]
+
+
+class Settings(MeasuredTargetFields):
+    """Sources, and what is usual."""
+
+    capture: Path
+    """a capture folder: fringes before both cameras, films of the target, or both"""
+    views: Annotated[int, Field(ge=0, le=1000)] = 24
+    """pairs of frames, out of all films of the target, in which it is looked for; 0 leaves films out"""
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """A calibration as the session shows it."""
+
+    drift: Drift
+    matches: Matches | None
+    views: int
+    points: Array  # (n, 3) mm, at which skin and target were seen
+    figures: Metrics
+
+
+def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
+    """Match the fringes of both cameras, find the target, estimate the drift, and write.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, shows nothing of the cameras' drift, or shows that something was moved; or `out`
+        can't be written to.
+    """
+    atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.target, settings.networks))
+    held = manifest.read_manifest(settings.capture)
+    calibration = calibration_files.read_for(held.calibration_file(settings.capture, settings.calibration), sizes(held))
+    matches, fault = None, None
+    try:
+        matches = match_fringes(settings, held, calibration, watch)
+    except InputError as found:
+        fault = found
+    film = look_at_target(settings, held, watch)
+    if fault is not None:
+        if not film:
+            raise fault
+        watch.say(f"warning     fringes: not used, skin and target drift apart unseen: {fault}")
+    if matches is None and not film:
+        expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
+        raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
+    with watch.busy("estimating the drift"):
+        found = correct(calibration, matches, film, settings)
+    for line in describe(found):
+        watch.say(line)
+    with atomic.new_folder(out, BY) as folder:
+        calibration_files.write(folder / OPTICS, found.drift.after)
+        metrics.write(folder / metrics.FILE, found.figures)
+        (folder / PAGE).write_text(write_page(found, held.name or settings.capture.resolve().name), encoding="utf-8")
+    watch.say(f"wrote       {out}/{{{OPTICS},{PAGE},{metrics.FILE}}}")
+
+
+def correct(
+    calibration: Calibration, matches: Matches | None, film: list[tuple[Sighting, Sighting]], settings: Settings
+) -> Corrected:
+    """Correct a calibration by points of the skin and views of the target.
+
+    Raises
+    ------
+    InputError
+        If they show more than drift.
+    """
+    target = target_of(settings)
+    found = drift.estimate(calibration, film or None, matches, target, settings.board_scale, settings.drift_px)
+    if found.size > LARGEST:
+        raise InputError(
+            f"{settings.capture}: expected devices that drifted by some {settings.drift_px:g} px since their calibration, found "
+            f"{found.size:.0f} times as much: was one pushed? `sonotwin check` names it; or is it another calibration? Give "
+            "drift_px=... of a rig that drifts more"
+        )
+    lit = [] if matches is None else [points_by_light(matches.pixels, matches.first, matches.axes, found.after.cameras)]
+    seen = [meet([found.after.cameras[name] for name in CAMERAS], [view.centres for view in pair])[0] for pair in film]
+    points = np.concatenate([*lit, *seen])
+    return Corrected(found, matches, len(film), points, measure(found, matches, len(film), points))
+
+
+def sizes(held: Manifest) -> dict[str, tuple[int, int]]:
+    """Image sizes of cameras and projector."""
+    return {name: device.size for name, device in held.devices.items() if name in (*CAMERAS, PROJECTOR)}
+
+
+def match_fringes(settings: Settings, held: Manifest, calibration: Calibration, watch: Watch) -> Matches | None:
+    """Points of the skin that both cameras see under the fringes; says why where the capture has none, and returns None.
+
+    Raises
+    ------
+    InputError
+        If images are missing or damaged, can't be decoded, or show too little in common.
+    """
+    taken = () if held.surface is None else held.surface.images
+    if missing := [name for name in CAMERAS if name not in taken]:
+        watch.say(f"fringes     none before {' and '.join(missing)}: skin and target drift apart unseen")
+        return None
+    if PROJECTOR not in calibration.cameras:
+        watch.say(f"fringes     not used: {PROJECTOR} isn't calibrated")
+        return None
+    maps = []
+    for camera in CAMERAS:
+        shots = surface_part.read_surface(settings.capture, camera, settings.calibration)
+        name = f"{shots.name}: {camera}"
+        maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=name, camera=camera))
+    given = (maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED)
+    matches = fringe_matches.match(*given, str(settings.capture))
+    axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
+    watch.say(f"fringes     {len(matches.pixels)} points in both cameras, {axes}")
+    return matches
+
+
+def look_at_target(settings: Settings, held: Manifest, watch: Watch) -> list[tuple[Sighting, Sighting]]:
+    """Views of the target by both cameras, in poses that differ, evenly out of all films."""
+    names = [name for name, part in held.sweeps.items() if set(CAMERAS) <= part.images.keys()] if settings.views else []
+    films = [stereo_frames.read_film(settings.capture, settings.calibration, name) for name in names]
+    total = sum(len(film.times) for film in films)
+    chosen = np.unique(np.linspace(0, total - 1, min(settings.views, total)).round().astype(int))
+    seen, target, first = [], target_of(settings), 0
+    for film in films:
+        some = film.some(chosen[(chosen >= first) & (chosen < first + len(film.times))] - first)
+        first += len(film.times)
+        tracker = make_tracker(settings, target, film.cameras, film.optics, film.bits)
+        pairs = watch.follow(some.pairs(), len(some.times), "looking at the target")
+        found = (each for _, each in poses_step.follow(tracker, some.times, pairs))
+        seen += target_poses.collect(found, film.cameras).seen
+    kept = [each.views for each in target_poses.evenly_lit(seen)]
+    if films:
+        watch.say(f"target      {len(kept)} views by both cameras, out of {len(chosen)}")
+    return kept
+
+
+def measure(found: Drift, matches: Matches | None, views: int, points: Array) -> Metrics:
+    """Figures of a correction."""
+    figures: Metrics = {
+        "matches": 0 if matches is None else len(matches.pixels),
+        "views": views,
+        "size": found.size,
+        "surprise_sigma": found.surprise,
+    }
+    for name, (change, sigma) in changes(found).items():
+        figures |= {f"{name.replace('.', '_')}_change": change, f"{name.replace('.', '_')}_sigma": sigma}
+    if PROJECTOR in found.after.cameras:
+        axes = (0,) if matches is None else matches.axes
+        before = Calibration(found.before.cameras, found.prior)
+        figures |= {
+            "skin_moved_mm": float(np.sqrt(np.mean(np.sum(drift.parted(found, points, axes) ** 2, axis=1)))),
+            "skin_sigma_before_mm": parting_sigma(before, points, axes),
+            "skin_sigma_mm": parting_sigma(found.after, points, axes),
+        }
+    return figures
+
+
+def parting_sigma(calibration: Calibration, points: Array, axes: Sequence[int]) -> float:
+    """Standard deviation, mm, by which skin and target part, over points : (n, 3) mm."""
+    assert calibration.uncertainty is not None
+    covariances = propagate(uncertainty.parting(calibration, points, axes), calibration.uncertainty.covariance)
+    return float(np.sqrt(np.mean(np.trace(covariances, axis1=-2, axis2=-1))))
+
+
+def changes(found: Drift) -> dict[str, tuple[float, float]]:
+    """Change and its standard deviation of each device's principal point, focal length and mount, px, rad and mm."""
+    told: dict[str, tuple[float, float]] = {}
+    assert found.after.uncertainty is not None
+    for device, camera in found.after.cameras.items():
+        step = difference(found.before.cameras[device], camera, SHOWN)
+        names = {name: f"{device}.{name}" for name in SHOWN}
+        told |= {
+            names[name]: (float(value), found.after.uncertainty.sigma(names[name]))
+            for name, value in zip(SHOWN, step, strict=True)
+            if names[name] in found.after.uncertainty.names
+        }
+    return told
+
+
+def describe(found: Corrected) -> Iterator[str]:
+    """Lines: how much drifted, and what it would have cost."""
+    size = "as usual" if found.drift.size == 1 else f"{found.drift.size:.1f} times the usual"
+    yield f"drift       {size} ({found.drift.surprise:.1f} sigma by usual drift)"
+    told = changes(found.drift)
+    for device in found.drift.after.cameras:
+        (x, x_sigma), (y, y_sigma) = (told[f"{device}.{name}"] for name in ("cx", "cy"))
+        yield f"{device:12}principal point {x:+.3f}, {y:+.3f} px (1 sigma {x_sigma:.3f}, {y_sigma:.3f})"
+    if "skin_moved_mm" in found.figures:
+        moved, before, left = (found.figures[f"skin_{name}_mm"] for name in ("moved", "sigma_before", "sigma"))
+        yield f"apart       skin from target by {moved:.3f} mm uncorrected (1 sigma {before:.3f}), and now 1 sigma {left:.3f} mm"
+
+
+def write_page(found: Corrected, name: str) -> str:
+    """The page as HTML."""
+    told, rows = changes(found.drift), []
+    for device in found.drift.after.cameras:
+        for parameter, unit, factor in (("cx", "px", 1), ("cy", "px", 1), ("fx", "px", 1), *MOUNT):
+            if f"{device}.{parameter}" in told:
+                change, sigma = told[f"{device}.{parameter}"]
+                rows.append((device, LABELS[parameter], f"{factor * change:+.3f} {unit}", f"{factor * sigma:.3f} {unit}"))
+    blocks = [page.table(("device", "parameter", "change", "1 σ"), rows)]
+    lines = [page.paragraph(line) for line in READING]
+    sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
+    figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
+    result = "The calibration holds as it was, within usual drift." if found.drift.size == 1 else "More than usual drift."
+    if "skin_moved_mm" in found.figures:
+        moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]
+        figures += [("skin from target, uncorrected", f"{moved:.3f}", "mm"), ("left, 1 σ", f"{left:.3f}", "mm")]
+    return page.render(Opening("Drift since the calibration", name, result, figures), sections, FOOTER)
+
+
+MOUNT = (*((name, "mrad", 1e3) for name in ("rx", "ry", "rz")), *((name, "mm", 1) for name in ("tx", "ty", "tz")))
+LABELS = {"cx": "principal point, x", "cy": "principal point, y", "fx": "focal length"}
+LABELS |= {f"r{axis}": f"turn about {axis}" for axis in "xyz"} | {f"t{axis}": f"shift along {axis}" for axis in "xyz"}
+READING = (
+    "Estimated together with all other errors of the calibration, whose covariance is known. Single parameters stay uncertain "
+    "where others do the same to the images; what all do together to the skin, beside the target, is in the figures above.",
+    "A common motion of all devices, and a common change of scale, show nowhere.",
+)
+FOOTER = "This file is complete: it fetches nothing."

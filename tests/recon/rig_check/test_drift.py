@@ -1,0 +1,104 @@
+"""Drift that a session shows is corrected, to what it says; no drift is left alone, and a pushed device isn't taken for drift."""
+
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from recon.geometry.camera_jacobian import MOTION
+from recon.model.calibration import DRIFT_PX, Calibration, Uncertainty
+from recon.optical_calibration import uncertainty
+from recon.rig_check import drift
+from recon.rig_check.optics_equations import points_by_light
+from twin.experiments import drawn_check
+from twin.optics.surface_session import calibration_of
+
+COLUMNS, SIGMA_PX = (0,), 0.02
+NOTHING = Uncertainty((), np.zeros((0, 0)))
+
+
+@pytest.fixture(scope="module")
+def calibration(rig) -> Calibration:
+    return calibration_of(rig)
+
+
+def corrected(rig, calibration, true, rng, views=0):
+    """The correction by vertical fringes, and views of the target."""
+    film = drawn_check.drawn_film(true, calibration.cameras, rig.target, 0.008, rng, views) if views else None
+    matches = drawn_check.drawn_matches(true, calibration.cameras, COLUMNS, SIGMA_PX, rng).some(slice(0, 300))
+    return drift.estimate(calibration, film, matches, rig.target, 3e-4, DRIFT_PX), matches
+
+
+def apart(cameras, true, matches):
+    """Mean displacement, mm, of the skin by light along camera 1's axis, against both cameras; and the places."""
+    places = points_by_light(matches.pixels, matches.first, COLUMNS, true)
+    found = drift.Drift(Calibration(cameras), NOTHING, Calibration(true), 1.0, 0.0)
+    return drift.parted(found, places, COLUMNS)[:, 2].mean(), places
+
+
+def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
+    """Over 20 rigs skin and target part by 0.1 mm and more; corrected by 3 um as predicted, to 5 sigma of chi-square."""
+    before, after, normal = [], [], []
+    for _ in range(20):
+        true = drawn_check.drawn_rig(calibration.cameras, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
+        found, matches = corrected(rig, calibration, true, rng)
+        before.append(apart(calibration.cameras, true, matches)[0])
+        left, places = apart(found.after.cameras, true, matches)
+        slope = uncertainty.parting(found.after, places, COLUMNS)[:, 2].mean(axis=0)
+        after.append(left)
+        normal.append(left / np.sqrt(slope @ found.after.uncertainty.covariance @ slope))
+    assert np.std(before) > 0.1 and np.std(after) < 0.01
+    assert abs(np.mean(np.square(normal)) - 1) < 5 * np.sqrt(2 / 20)
+
+
+def test_views_of_the_target_show_what_vertical_fringes_do_not(rig, calibration, rng):
+    """How far camera 2 drifted across its epipolar lines: sigma of what parts skin and target along the fringes."""
+    true = drawn_check.drawn_rig(calibration.cameras, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
+    point, sigmas = np.array([[0.0, 0.0, 650.0]]), []
+    for views in (0, 12):
+        found, _ = corrected(rig, calibration, true, rng, views)
+        slope = uncertainty.parting(found.after, point, COLUMNS)[0, 1]
+        sigmas.append(np.sqrt(slope @ found.after.uncertainty.covariance @ slope))
+    assert sigmas[0] > 0.001 and sigmas[1] < 0.2 * sigmas[0]
+
+
+def test_without_drift_nothing_is_harmed(rig, calibration, rng):
+    """The correction is that of noise: micrometres, where usual drift parts skin and target by a tenth of a millimetre."""
+    found, matches = corrected(rig, calibration, calibration.cameras, rng)
+    assert found.size == 1 and found.surprise < 3
+    assert abs(apart(found.after.cameras, calibration.cameras, matches)[0]) < 0.01
+
+
+def test_larger_drift_is_as_large_as_it_is(rig, calibration):
+    """The median of five rigs whose devices drifted four times as far, within a factor of two."""
+    sizes = []
+    for seed in range(5):
+        rng = np.random.default_rng([7, seed])
+        true = drawn_check.drawn_rig(calibration.cameras, drift.usual_drift(calibration.cameras, 4 * DRIFT_PX), rng)
+        found, matches = corrected(rig, calibration, true, rng, 8)
+        sizes.append(found.size)
+        assert abs(apart(found.after.cameras, true, matches)[0]) < 0.02
+    assert 2 < np.median(sizes) < 8
+
+
+def test_a_pushed_camera_is_no_drift(rig, calibration, rng):
+    """By 0.1 deg, 5.8 px: a hundred times the drift."""
+    found, _ = corrected(rig, calibration, drawn_check.turned(calibration.cameras, rng, "cam2", 0.1), rng, 8)
+    assert found.size > drift.LARGEST and found.surprise > 5
+
+
+def test_mounts_move_the_devices_as_predicted(calibration, rng):
+    """Motions of 2000 drawn mounts, camera 1's too, in camera 1's frame: variances and covariances to 6 standard deviations."""
+    known, cameras = drift.usual_drift(calibration.cameras, DRIFT_PX), calibration.cameras
+    sizes = DRIFT_PX * np.repeat([drift.TURN_PER_PX, drift.SHIFT_PER_PX], 3)
+    steps = []
+    for motion in rng.standard_normal((2000, 3, 6)) * sizes:
+        first, *others = (rigid.moved(np.eye(4), step) for step in motion)
+        for device, own in zip(("cam2", "projector"), others, strict=True):
+            place = cameras[device].camera_from_world
+            steps.append(rigid.difference(place, own @ place @ rigid.invert(first)))
+    drawn = np.cov(np.reshape(steps, (2000, 12)), rowvar=False)
+    names = [f"{device}.{name}" for device in ("cam2", "projector") for name in MOTION]
+    at = [known.names.index(name) for name in names]
+    expected = known.covariance[np.ix_(at, at)]
+    spread = np.sqrt((np.outer(np.diag(expected), np.diag(expected)) + expected**2) / 2000)
+    assert np.abs((drawn - expected) / spread).max() < 6
