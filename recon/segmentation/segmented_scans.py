@@ -13,7 +13,7 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.geometry.primitives import Cylinder
 from recon.model.probe import SCANNER_SPEED
-from recon.segmentation import mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
+from recon.segmentation import contact, mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
@@ -66,6 +66,10 @@ def find_masses(
     none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
     lines += [f"blur        {blur}"] if blur is not None and found else []
+    if skin is not None:
+        touching = contact.measure(scans, skin)
+        figures |= touching.figures
+        lines += touching.lines
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
         speeds = Speeds(speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)

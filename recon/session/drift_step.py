@@ -17,6 +17,7 @@ from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.geometry.camera_jacobian import difference
 from recon.model.calibration import Calibration
+from recon.model.rig import Target
 from recon.optical_calibration import uncertainty
 from recon.reports import page
 from recon.reports.page import Opening, Section
@@ -24,7 +25,7 @@ from recon.rig_check import drift, fringe_matches
 from recon.rig_check.drift import LARGEST, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
-from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, TrackingFields, make_tracker, target_of
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
@@ -54,8 +55,12 @@ class Corrected:
     drift: Drift
     matches: Matches | None
     views: int
-    points: Array  # (n, 3) mm, at which skin and target were seen
     figures: Metrics
+
+    @property
+    def is_drift(self) -> bool:
+        """Whether no device moved by more than drift."""
+        return self.drift.size <= LARGEST
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
@@ -84,7 +89,13 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
         raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
     with watch.busy("estimating the drift"):
-        found = correct(calibration, matches, film, settings)
+        found = correct(calibration, matches, film, target_of(settings), settings)
+    if not found.is_drift:
+        cause = (
+            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is for rigs that drift more"
+        )
+        expected = f"expected devices that drifted by some {settings.drift_px:g} px since their calibration"
+        raise InputError(f"{settings.capture}: {expected}, found {found.drift.size:.0f} times as much: {cause}")
     for line in describe(found):
         watch.say(line)
     with atomic.new_folder(out, BY) as folder:
@@ -95,27 +106,17 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
 
 
 def correct(
-    calibration: Calibration, matches: Matches | None, film: list[tuple[Sighting, Sighting]], settings: Settings
+    calibration: Calibration,
+    matches: Matches | None,
+    film: Sequence[tuple[Sighting, Sighting]],
+    target: Target,
+    settings: TrackingFields,
 ) -> Corrected:
-    """Correct a calibration by points of the skin and views of the target.
-
-    Raises
-    ------
-    InputError
-        If they show more than drift.
-    """
-    target = target_of(settings)
+    """Correct a calibration by points of the skin and views of the target, one of which may be missing."""
     found = drift.estimate(calibration, film or None, matches, target, settings.board_scale, settings.drift_px)
-    if found.size > LARGEST:
-        raise InputError(
-            f"{settings.capture}: expected devices that drifted by some {settings.drift_px:g} px since their calibration, found "
-            f"{found.size:.0f} times as much: was one pushed? `sonotwin check` names it; or is it another calibration? Give "
-            "drift_px=... of a rig that drifts more"
-        )
     lit = [] if matches is None else [points_by_light(matches.pixels, matches.first, matches.axes, found.after.cameras)]
     seen = [meet([found.after.cameras[name] for name in CAMERAS], [view.centres for view in pair])[0] for pair in film]
-    points = np.concatenate([*lit, *seen])
-    return Corrected(found, matches, len(film), points, measure(found, matches, len(film), points))
+    return Corrected(found, matches, len(film), measure(found, matches, len(film), np.concatenate([*lit, *seen])))
 
 
 def sizes(held: Manifest) -> dict[str, tuple[int, int]]:

@@ -4,8 +4,8 @@ Reads a capture folder with the calibrations in use and any of three parts, take
 both cameras see the target moved about, tilted to all sides; a fringe sequence of anything smooth, seen by both cameras, best
 with fringes along both axes; and ten seconds of tracked B-scans over a flat, rough bottom in water, the probe rolled, tilted and
 moved up and down. Writes into the folder `out` check.html, the verdicts with their course over the days of `log`, and check.json.
-An error that the calibrations admit by their covariance, and usual drift, are no alarm. Exit status 1 if something has moved.
-Takes some seconds.
+An error that the calibrations admit by their covariance, and usual drift, are no alarm; where nothing else has moved, optics.yaml
+beside them is the calibration corrected for such drift. Exit status 1 if something has moved. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
@@ -28,9 +28,10 @@ from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
 from recon.rig_check import bottom_equations, check_log, check_page, fringe_matches, verdicts
 from recon.rig_check.bottom_equations import Known
+from recon.rig_check.drift import Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches
 from recon.rig_check.verdicts import Optics, Verdict
-from recon.session import poses_step
+from recon.session import drift_step, poses_step
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
@@ -51,7 +52,7 @@ class Config(MeasuredTargetFields):
     capture: Path
     """folder: what it holds of these is checked: a film of the target, fringes before both cameras, a bottom"""
     out: Path
-    """folder: gets check.html, check.json"""
+    """folder: gets check.html, check.json, and optics.yaml, corrected for drift, where no device was moved"""
     log: Path | None = None
     """file of all checks, a line each, that this one is added to, such as rig.jsonl; null keeps no log"""
     film: manifest.SweepNameOrNone = ""
@@ -104,8 +105,8 @@ def run(config: Config) -> int:
     held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
     for line in left_out(held):
         watch.say(line)
-    found = [*optics(config, listed, held, watch)]
-    found += verdicts.doubted(tank(config, held, watch), found)
+    devices, corrected = optics(config, listed, held, watch)
+    found = [*devices, *verdicts.doubted(tank(config, held, watch), devices)]
     made = check_log.check(listed.name or config.capture.resolve().name, found)
     for line in check_page.lines(made):
         watch.say(line)
@@ -113,9 +114,11 @@ def run(config: Config) -> int:
     with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
+        if corrected is not None:
+            calibration_files.write(folder / drift_step.OPTICS, corrected.after)
         if config.log is not None:  # last, so that whatever fails leaves both as they were
             check_log.add(config.log, made)
-    watch.say(f"wrote       {config.out}/{{{CHECK},{PAGE}}}")
+    watch.say(f"wrote       {config.out}/{{{','.join([CHECK, PAGE, *([drift_step.OPTICS] if corrected else [])])}}}")
     return int(any(one.state == "moved" for one in found))
 
 
@@ -163,10 +166,10 @@ def left_out(held: Held) -> list[str]:
     return [f"{name:12}{way}" for name, (lacking, way) in ways.items() if lacking]
 
 
-def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> list[Verdict]:
-    """Verdicts on cameras, projector and target."""
+def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> tuple[list[Verdict], Drift | None]:
+    """Verdicts on cameras, projector and target, and the calibration corrected for drift, where they show no more than drift."""
     if held.film is None and not held.fringes:
-        return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")]
+        return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")], None
     file = listed.calibration_file(config.capture, config.calibration)
     wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
@@ -179,7 +182,13 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
-    return verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma)
+    found = verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma)
+    if config.drift_px == 0 or any(one.state in ("moved", "maybe") for one in found):
+        return found, None
+    corrected = drift_step.correct(calibration, matches, film or (), target, config)
+    for line in drift_step.describe(corrected):
+        watch.say(line)
+    return found, corrected.drift if corrected.is_drift else None
 
 
 def filmed(

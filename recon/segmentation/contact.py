@@ -1,0 +1,118 @@
+"""Contact of the array's face with the skin: the one place where what sound and tracking place meets what light measured.
+
+The face touches the skin, through a little gel. So its measured distance from the measured skin checks all at once: the optics,
+the tracking, the probe's calibration, the latency, and that the skin stayed where it was and as it was.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from recon.estimation.covariance import propagate
+from recon.files.metrics import Metrics
+from recon.freehand import place_uncertainty
+from recon.freehand.scans import Scans
+from recon.model.probe import NAMES
+from recon.segmentation.containment import below
+
+Array = NDArray[np.float64]
+
+PLACES = 9  # along the face
+GEL_MM = 1.0  # of gel, that the face stands off at most without a word; assumed
+FEWEST = 5  # B-scans over the skin
+ALARM_SIGMA = 3.0
+CAUSES = "skin that is pressed, that moved since the fringes, devices that drifted, or a wrong lag"
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Distances of the array's face from the skin, along a sweep."""
+
+    distances_mm: Array  # (n,) of the nearest place of the face, negative within the skin; NaN beside it, or without a pose
+    sigma_mm: float  # standard deviation of their median, by what errs alike in all; NaN where the calibration's isn't known
+
+    @property
+    def median_mm(self) -> float:
+        """Median distance; NaN of too few."""
+        seen = self.distances_mm[np.isfinite(self.distances_mm)]
+        return float(np.median(seen)) if len(seen) >= FEWEST else np.nan
+
+    @property
+    def range_mm(self) -> tuple[float, float]:
+        """What nine of ten B-scans lie between."""
+        low, high = np.nanquantile(self.distances_mm, [0.05, 0.95]).tolist()
+        return low, high
+
+    @property
+    def figures(self) -> Metrics:
+        """Figures, each named with its unit; none of too few B-scans."""
+        if np.isnan(self.median_mm):
+            return {}
+        low, high = self.range_mm
+        spread = {"contact_low_mm": low, "contact_high_mm": high}
+        return {"contact_mm": self.median_mm, "contact_sigma_mm": self.sigma_mm, **spread}
+
+    @property
+    def lines(self) -> list[str]:
+        """A line, and a warning where the face doesn't meet the skin."""
+        if np.isnan(self.median_mm):
+            return []
+        low, high = self.range_mm
+        known = f" ± {self.sigma_mm:.2f}" if np.isfinite(self.sigma_mm) else ""
+        span = f"{low:+.2f} to {high:+.2f} in nine B-scans of ten"
+        told = [f"contact     the array's face stands {self.median_mm:+.2f}{known} mm off the skin, {span}"]
+        most = ALARM_SIGMA * np.nan_to_num(self.sigma_mm)
+        if self.median_mm < -most:
+            told.append(f"warning     contact: the face lies within the measured skin: {CAUSES}?")
+        elif self.median_mm > GEL_MM + most:
+            told.append(f"warning     contact: the face doesn't reach the measured skin: much gel, or {CAUSES}?")
+        return told
+
+
+def measure(scans: Scans, skin: trimesh.Trimesh) -> Contact:
+    """Distances of the face in each B-scan from a skin, with what is known of their errors.
+
+    What errs alike in skin and probe isn't in sigma: the frame of the optics, and the target's print, which the probe's
+    calibration has in it.
+    """
+    row = 0.0 if scans.probe is None else scans.probe.face_row
+    face = np.column_stack([np.linspace(0, scans.shape[1] - 1, PLACES), np.full(PLACES, row), np.zeros(PLACES), np.ones(PLACES)])
+    placed = np.flatnonzero(np.isfinite(scans.world_from_pixel).all(axis=(1, 2)))
+    distances, nearest, normals = (
+        np.full(len(scans.world_from_pixel), np.nan),
+        np.zeros(len(placed), int),
+        np.zeros((len(placed), 3)),
+    )
+    if not len(placed):
+        return Contact(distances, np.nan)
+    places = np.einsum("nij,mj->nmi", scans.world_from_pixel[placed], face)[..., :3]
+    depths, towards, _ = below(places.reshape(-1, 3), skin)
+    off = -depths.reshape(len(placed), PLACES)
+    over = np.isfinite(off).any(axis=1)
+    nearest[over] = np.nanargmin(off[over], axis=1)
+    normals = towards.reshape(len(placed), PLACES, 3)[np.arange(len(placed)), nearest]
+    distances[placed[over]] = np.nanmin(off[over], axis=1)
+    return Contact(distances, _sigma(scans, placed[over], face[nearest[over], :2], normals[over]))
+
+
+def _sigma(scans: Scans, used: NDArray[np.intp], pixels: Array, normals: Array) -> float:
+    """Standard deviation of the mean distance, mm, of some B-scans, at pixels : (n, 2), along normals : (n, 3)."""
+    probe, errors = scans.probe, scans.errors
+    if probe is None or probe.uncertainty is None or not len(used):
+        return np.nan
+    terms = np.column_stack([np.ones(len(pixels)), pixels])
+
+    def along(slopes: Array) -> Array:
+        """Derivatives : (n, k) of the distances, from slopes : (n, 3, 3, k) of places as of `place_uncertainty`."""
+        return np.einsum("nt,ntik,ni->nk", terms, slopes, normals)
+
+    world = scans.world_from_pixel[used]
+    by_probe = along(place_uncertainty.probe_slopes(world, probe)).mean(axis=0)
+    variance = float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
+    if errors is not None:
+        by_lag = along(place_uncertainty.rate_slopes(errors.rates[used])).mean(axis=0)
+        by_each = errors.shares[used].T @ along(place_uncertainty.pose_slopes(world, probe)) / len(used)
+        variance += float(errors.lag_s**2 * by_lag @ by_lag + np.einsum("mk,mkl,ml->", by_each, errors.poses, by_each))
+    return float(np.sqrt(variance))
