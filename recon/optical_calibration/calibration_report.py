@@ -255,8 +255,9 @@ def _millimetre_maps(found: Calibration, metrics: Metrics, depths: Sequence[floa
     blocks.append(
         page.paragraph(
             f"Over the image of {first}, for points measured with {first} and {second}, without the noise of that measurement. "
-            f"Lengths share an uncertainty of scale of {shown(metrics['scale_sigma_ppm'], '.0f')} ppm, to which the board’s own "
-            "scale comes on top: that of a board printed 0.1 % too large makes everything 0.1 % too small."
+            f"Lengths share an uncertainty of scale of {shown(metrics['scale_sigma_ppm'], '.0f')} ppm, that of the board’s print "
+            "(board_scale) included: a board printed 0.1 % too large makes everything 0.1 % too small. Known lengths make it "
+            "less: a board on glass, or a calliper over the outermost points of this one."
         )
     )
     return blocks

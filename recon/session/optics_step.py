@@ -13,7 +13,7 @@ from recon.capture.layouts import meza2021
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
-from recon.model.calibration import Calibration
+from recon.model.calibration import Calibration, with_scale
 from recon.optical_calibration import board_frames, calibration_report, figures_of_merit, joint_calibration
 from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
@@ -21,6 +21,7 @@ from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
+from recon.session.settings import BoardField
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import surface_figures
 
@@ -38,7 +39,7 @@ CONTENTS = {
 }
 
 
-class Settings(joint_calibration.Settings):
+class Settings(BoardField, joint_calibration.Settings):
     """Sources, and settings of the calibration."""
 
     capture: Path
@@ -76,7 +77,7 @@ def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> N
     captured = board_part.read_board(settings.capture)
     sizes = board_frames.sizes_of(captured, settings.devices)
     truth = None if settings.truth is None else calibration_files.read_for(settings.truth / manifest.OPTICS, sizes)
-    found = calibrate(captured, settings, settings.devices, truth, watch)
+    found = calibrate(captured, settings, settings.devices, truth, watch, settings.board_scale)
     names = write(out, found, command, truth)
     watch.say(f"wrote       {out}/{{{','.join(names)}}}")
 
@@ -87,6 +88,7 @@ def calibrate(
     devices: tuple[DeviceName, ...] | None = None,
     truth: Calibration | None = None,
     watch: Watch = SILENT,
+    board_scale: float = 0.0,
 ) -> Optics:
     """Calibrate cameras and projector, all at once, by a board in many poses.
 
@@ -94,6 +96,7 @@ def calibrate(
     ----------
     devices : that are calibrated; None for all of the capture
     truth : of a rendered capture, for the figures alone
+    board_scale : relative standard deviation of the print's scale, which no image shows; 0 leaves what its shape says of it
 
     Raises
     ------
@@ -127,6 +130,9 @@ def calibrate(
             result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
         )
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
+    made = result.adjustment.calibration
+    known = with_scale(made.uncertainty, made.cameras, board_scale) if len(made.cameras) > 1 else made.uncertainty
+    result = replace(result, adjustment=replace(result.adjustment, calibration=replace(made, uncertainty=known)))
     figures = figures_of_merit.measure(result, truth)
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
     for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):

@@ -196,7 +196,7 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
     def work(by_board: optics_step.Settings, out: Path) -> None:
         optics_step.run(by_board, out, sources.command(by_board, out), sources.watch)
 
-    does, fields = "cameras and projector, from the board", {"capture": settings.capture}
+    does, fields = "cameras and projector, from the board", {"capture": settings.capture, "board_scale": settings.board_scale}
     made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, sources.files("board"))
     return None if made is None else made / optics_step.OPTICS
 

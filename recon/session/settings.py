@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
+from recon.model.calibration import PRINT_SCALE
 from recon.model.rig import NotNegative, Part, Probe
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
@@ -14,6 +15,14 @@ from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
 Spacing = Annotated[float, Field(ge=0.01, le=100)]  # mm, of a volume's voxels
 OF_THE_SCALE = "rig.probe.scale_mm_per_px"
+
+
+class BoardField(Part):
+    """The field of a step whose lengths are those of a calibration board."""
+
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
+    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
+    less: of paper by moisture; 1e-5 of chrome on glass; of a print, 0.03 mm by a calliper over 150 mm are 2e-4"""
 
 
 class TargetField(Part):

@@ -7,11 +7,11 @@ from pydantic import Field
 
 from recon.capture import target_files
 from recon.geometry.camera import Camera
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty
+from recon.model.calibration import DRIFT_PX, Uncertainty
 from recon.model.part import Part
 from recon.model.rig import Rig, Target
 from recon.registry import Choice
-from recon.session.settings import TargetField
+from recon.session.settings import BoardField, TargetField
 from recon.tracking import networks
 from recon.tracking.networks import OnnxNetworks
 from recon.tracking.tracker import Tracker
@@ -32,15 +32,12 @@ class NetworkFields(Part):
         return networks.load(self.networks or networks.WEIGHTS, threads, kind, self.naming == "geometry", way)
 
 
-class TrackingFields(NetworkFields):
+class TrackingFields(BoardField, NetworkFields):
     """Fields of a step that tracks the target by cameras some time after their calibration."""
 
     drift_px: Annotated[float, Field(ge=0, le=10)] = DRIFT_PX
     """px, standard deviation of principal points since the calibration: warmth, a turned mount; focal lengths by 4e-4 of it,
     relative"""
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
-    less: of paper by moisture; 1e-5 of chrome on glass"""
 
 
 class TrackerFields(TrackingFields):

@@ -53,6 +53,7 @@ def sessions(setup: Setup, sessions: int = 200, times: float = 1.0, views: int =
     figures = {
         "sessions": sessions,
         "times": times,
+        "views": views,
         "inside_percent": 100 * float(np.mean([one.inside for one in found])),
         "alarms_percent": 100 * float(np.mean([one.size > drift.LARGEST for one in found])),
         "size_median": float(np.median([one.size for one in found])),

@@ -7,8 +7,12 @@ from numpy.typing import NDArray
 
 from recon.capture import calibration_files
 from recon.capture.images import read_images
+from recon.capture.surface_part import SurfaceCapture
+from recon.geometry.order_statistics import NORMAL_MAD
+from recon.geometry.surface_tree import surface_tree
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.model.rig import Rig
+from recon.session import skin_step
 from recon.structured_light.decode import ProjectorMap, Status, decode
 from recon.structured_light.surface_mesh import clean
 from recon.structured_light.triangulate import PointMap, triangulate
@@ -21,10 +25,12 @@ from twin.evaluation.surface_errors import Comparison, Metrics, Truth
 from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.light_transport import Tracing
 from twin.optics.ray_world import visible
-from twin.optics.surface_session import Shooting, View, calibration_of, shoot
+from twin.optics.surface_session import CameraName, Shooting, View, calibration_of, shoot
 
 TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
 REAL_DEPTH_MM = (690.0, 780.0)
+CAMERAS: tuple[CameraName, ...] = ("cam1", "cam2")
+EVERY, NEAR_MM = 7, 0.5  # of the true points one is looked at; from the surface, within which it has that point
 WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
 
 
@@ -88,6 +94,31 @@ def sphere(setup: Setup) -> Figures:
 def breast(setup: Setup) -> Figures:
     """The breast phantom on its table."""
     return experiment(setup.rig, build_scene({"kind": "breast"}), setup.sequences["paper_surface"], seed=20).metrics
+
+
+def breast_by_both(setup: Setup) -> Figures:
+    """The breast phantom, by both cameras beside one: noise, its prediction, and what of all that either sees became surface."""
+    scene, patterns, calibration = build_scene({"kind": "breast"}), setup.sequences["paper_surface"], calibration_of(setup.rig)
+    views = {name: shoot(setup.rig, scene, patterns, name, TRACING, SHOOTING, 20) for name in CAMERAS}
+    shots = {name: SurfaceCapture(view.images, patterns, 8, calibration, scene.name) for name, view in views.items()}
+    one = skin_step.reconstruct(shots["cam1"])
+    both = skin_step.reconstruct(shots["cam1"], others={"cam2": lambda: shots["cam2"]})
+    truth = views["cam1"].truth
+    errors = [np.sum((skin.points.points - truth.points) * truth.normals, axis=-1) for skin in (one, both)]
+    normal = errors[1] / (both.points.sigma * np.abs(np.sum(calibration.cameras["cam1"].pixel_rays() * truth.normals, axis=-1)))
+    inner = np.isfinite(errors).all(axis=0) & (np.abs(errors) < surface_errors.GROSS_MM).all(axis=0)
+    seen = np.concatenate([view.truth.points[view.truth.lit][::EVERY] for view in views.values()]).astype(float)
+    away = surface_tree(both.mesh.vertices).query(seen)[0]
+    return {
+        "noise_ratio": _spread(errors[1][inner]) / _spread(errors[0][inner]),
+        "z_spread_off": abs(_spread(normal[inner]) - 1),
+        "coverage": float(np.mean(away < NEAR_MM)),
+    }
+
+
+def _spread(values: NDArray[np.floating]) -> float:
+    """Standard deviation, by the median distance from the median: edges have errors of other kinds."""
+    return float(NORMAL_MAD * np.median(np.abs(values - np.median(values))))
 
 
 def orders_under_stress(setup: Setup, sequence: str) -> Figures:

@@ -43,6 +43,13 @@ def test_breast(setup, rig):
     check(surface_accuracy.breast, replace(setup, rig=rig.model_copy(update={"cam1": cropped(rig.cam1, (720, 600))})))
 
 
+def test_breast_by_both_cameras(setup):
+    """Less noise, as predicted, by cameras of half the size, at whose borders not all fringes can be followed."""
+    half = setup.rig.model_copy(update={"cam2": shrunk(setup.rig.cam2, 2)})
+    found = surface_accuracy.breast_by_both(replace(setup, rig=half))
+    assert found["noise_ratio"] < 0.6 and found["z_spread_off"] < 0.15 and found["coverage"] > 0.95
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("sequence", ["gray_surface", "multi_frequency", "paper_surface"])
 def test_no_wrong_order_survives(setup, sequence):
