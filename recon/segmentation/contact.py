@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 
 PLACES = 9  # along the face
 GEL_MM = 1.0  # of gel, that the face stands off at most without a word; assumed
+GIVEN_MM = 0.05  # standard deviation by which a bracket gives between wires and sweep; assumed: a printed one, pressed
 FEWEST = 5  # B-scans over the skin
 ALARM_SIGMA = 3.0
 CAUSES = "skin that is pressed, that moved since the fringes, devices that drifted, or a wrong lag"
@@ -110,7 +111,7 @@ def _sigma(scans: Scans, used: NDArray[np.intp], pixels: Array, normals: Array) 
 
     world = scans.world_from_pixel[used]
     by_probe = along(place_uncertainty.probe_slopes(world, probe)).mean(axis=0)
-    variance = float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
+    variance = GIVEN_MM**2 + float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
     if errors is not None:
         by_lag = along(place_uncertainty.rate_slopes(errors.rates[used])).mean(axis=0)
         by_each = errors.shares[used].T @ along(place_uncertainty.pose_slopes(world, probe)) / len(used)

@@ -59,16 +59,17 @@ def test_sigma_is_what_errs_alike_and_what_averages(skin):
     own = np.tile(np.diag([0, 0, 0, 0.2, 0.2, 0.2]) ** 2, (COUNT, 1, 1))
     errors = PlaceErrors(own, np.eye(COUNT), nothing, np.zeros((COUNT, 4, 4)))
     found = contact.measure(sweep(0.0, along_beam, errors), skin)
-    assert found.sigma_mm == pytest.approx(np.hypot(0.1, 0.2 / np.sqrt(COUNT)), rel=1e-6)
+    assert found.sigma_mm == pytest.approx(np.linalg.norm([0.1, 0.2 / np.sqrt(COUNT), contact.GIVEN_MM]), rel=1e-6)
 
 
 def test_the_latency_shows_where_the_probe_moves_along_its_beam(skin):
-    """5 mm/s and 10 ms are 0.05 mm."""
+    """5 mm/s and 10 ms are 0.05 mm, beside what a bracket gives."""
     rates = np.zeros((COUNT, 4, 4))
     rates[:, 2, 3] = 5.0
     nothing = np.zeros((COUNT, 6, 6))
     errors = PlaceErrors(nothing, np.eye(COUNT), nothing, rates, lag_s=0.01)
-    assert contact.measure(sweep(0.0, np.zeros((8, 8)), errors), skin).sigma_mm == pytest.approx(0.05, rel=1e-6)
+    found = contact.measure(sweep(0.0, np.zeros((8, 8)), errors), skin)
+    assert found.sigma_mm == pytest.approx(np.hypot(0.05, contact.GIVEN_MM), rel=1e-6)
 
 
 @pytest.mark.parametrize(("off_mm", "said"), [(-0.4, "within the measured skin"), (0.0, ""), (0.8, ""), (1.6, "doesn't reach")])
