@@ -43,7 +43,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "import": {""},
     "import-sweep": {""},
     "describe": {""},
-    "reconstruct": {""},
+    "reconstruct": {"", "optics/optics.yaml"},
 }
 WRITTEN = ("out", "document", "log")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
@@ -68,17 +68,18 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/surface/surface.ply",
         "result/masses/scan",
         "result/optics/optics.yaml",
+        "result/drift/optics.yaml",
         "result/probe/probe.yaml",
         "result/latency/lag.json",
     },
     "live-check.md": {"morning", "lag/lag.json"},
-    "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/optics/optics.yaml"}
+    "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/drift/optics.yaml"}
     | {"now.ply", "before.ply", "masses", "optics.yaml"},
     "recordings.md": {"photographs", "procam", "L", "caliInfo.yml", "spine.xml", "poses.csv"}
     | {"examples_ybr_color.dcm"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},
     "live-navigate.md": {"session/capture", "result/surface/surface.ply", "result/masses/scan"}
-    | {"result/optics/optics.yaml", "result/probe/probe.yaml"},
+    | {"result/drift/optics.yaml", "result/probe/probe.yaml"},
     "rig-software.md": {"board", "surface"},
     "tracking.md": {"session", "probe.yaml"},
 }

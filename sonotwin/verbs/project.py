@@ -9,7 +9,7 @@ and curves; expected_cam1.png, what camera 1 should see of it; and metrics.json.
 
 With `show=true` and a laboratory's `devices` the projector, a second display, then shows the picture until Ctrl-C.
 
-    sonotwin project skin=result/surface/surface.ply masses=result/masses/scan calibration=result/optics/optics.yaml out=light
+    sonotwin project skin=result/surface/surface.ply masses=result/masses/scan calibration=result/drift/optics.yaml out=light
     sonotwin project skin=now.ply earlier_skin=before.ply masses=masses calibration=optics.yaml eye_mm=[0,300,100] out=light
     sonotwin project skin=now.ply masses=masses calibration=optics.yaml out=light show=true devices=basler
 """
