@@ -11,13 +11,11 @@ from recon.capture.lag_files import LagFile
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import ProbeCalibration
-from recon.optical_calibration.uncertainty import working_volume
 from recon.probe_calibration.sound_in_water import speed_of_sound
-from recon.rig_check.optics_equations import points_by_light
-from recon.tracking.pose_fit import meet
 from scenes.board_poses import Config as Poses
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
+from tests.twin.parting import parted_mm
 from tests.twin.small_rigs import half, half_as_fields
 from twin.conditions import IDEAL
 from twin.experiments.drawn_session import Noise, calibrated_optics
@@ -128,13 +126,3 @@ def test_a_rendered_rig_is_as_calibrated_but_for_a_projector_that_was_shifted(ri
     assert corrected.is_file() != bool(shift_mm)  # what was moved is calibrated anew
     if not shift_mm:
         assert parted_mm(corrected, tmp_path / "truth") < 0.015 < parted_mm(drifted / "optics.yaml", tmp_path / "truth")
-
-
-def parted_mm(file, truth):
-    """Mean distance by which a calibration parts the skin by light from both cameras' own, at places that all devices see."""
-    known, true = calibration_files.read(file).cameras, calibration_files.read(truth / "calibration/optics.yaml")
-    places = working_volume(true, [650.0, 680.0])
-    seen = {name: camera.project(places) for name, camera in true.cameras.items()}
-    by_light = points_by_light(seen["cam1"], seen["projector"], (0, 1), known)
-    by_both = meet([known[name] for name in ("cam1", "cam2")], [seen[name] for name in ("cam1", "cam2")])[0]
-    return np.linalg.norm((by_light - by_both).mean(axis=0))
