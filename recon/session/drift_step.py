@@ -16,6 +16,7 @@ from recon.estimation.covariance import propagate
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.geometry.camera_jacobian import difference
+from recon.model import circle_layout
 from recon.model.calibration import Calibration
 from recon.model.rig import Target
 from recon.optical_calibration import uncertainty
@@ -25,7 +26,7 @@ from recon.rig_check import drift, fringe_matches
 from recon.rig_check.drift import LARGEST, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
-from recon.session.tracker_settings import MeasuredTargetFields, TrackingFields, make_tracker, target_of
+from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
@@ -33,6 +34,7 @@ from recon.tracking.pose_fit import Sighting, meet
 
 BY = "correct-optics"  # who writes
 OPTICS, PAGE = "optics.yaml", "drift.html"
+OPEN_SCALE = 0.01  # relative standard deviation of lengths that tell nothing of the scale
 SEED = 0  # of the points under the fringes
 SHOWN = ("cx", "cy", "fx", "rx", "ry", "rz", "tx", "ty", "tz")  # parameters that a device's drift is told by
 
@@ -110,13 +112,24 @@ def correct(
     matches: Matches | None,
     film: Sequence[tuple[Sighting, Sighting]],
     target: Target,
-    settings: TrackingFields,
+    settings: MeasuredTargetFields,
 ) -> Corrected:
-    """Correct a calibration by points of the skin and views of the target, one of which may be missing."""
-    found = drift.estimate(calibration, film or None, matches, target, settings.board_scale, settings.drift_px)
+    """Correct a calibration by points of the skin and views of the target, one of which may be missing.
+
+    A target of known lengths tells the scale, too; not one that cameras measured, whose lengths have theirs.
+    """
+    known = target if settings.target is None else with_open_scale(target)
+    found = drift.estimate(calibration, film or None, matches, known, settings.board_scale, settings.drift_px)
     lit = [] if matches is None else [points_by_light(matches.pixels, matches.first, matches.axes, found.after.cameras)]
     seen = [meet([found.after.cameras[name] for name in CAMERAS], [view.centres for view in pair])[0] for pair in film]
     return Corrected(found, matches, len(film), measure(found, matches, len(film), np.concatenate([*lit, *seen])))
+
+
+def with_open_scale(target: Target) -> Target:
+    """The target with lengths that may all be longer or shorter together."""
+    lengths = circle_layout.lengths(target)
+    covariance = circle_layout.length_covariance(target) + np.outer(*2 * (OPEN_SCALE * lengths,))
+    return target.model_copy(update={"covariance_mm2": tuple(map(tuple, covariance.tolist()))})
 
 
 def sizes(held: Manifest) -> dict[str, tuple[int, int]]:

@@ -5,10 +5,13 @@ import pytest
 
 from recon.geometry import rigid
 from recon.geometry.camera_jacobian import MOTION
+from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, Calibration, Uncertainty
 from recon.optical_calibration import uncertainty
 from recon.rig_check import drift
 from recon.rig_check.optics_equations import points_by_light
+from recon.session import drift_step
+from recon.tracking.pose_fit import meet
 from twin.experiments import drawn_check
 from twin.optics.surface_session import calibration_of
 
@@ -102,3 +105,28 @@ def test_mounts_move_the_devices_as_predicted(calibration, rng):
     expected = known.covariance[np.ix_(at, at)]
     spread = np.sqrt((np.outer(np.diag(expected), np.diag(expected)) + expected**2) / 2000)
     assert np.abs((drawn - expected) / spread).max() < 6
+
+
+def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
+    """By a microscope, to 0.002 mm of 25: from 3e-4 of a print to 5e-5, as predicted over ten rigs; one by cameras tells nothing."""
+    target = rig.target.model_copy(update={"tolerance_mm": 0.002, "covariance_mm2": None})
+    normal = []
+    for seed in range(10):
+        rng = np.random.default_rng([11, seed])
+        wrong = drawn_check.drawn_rig(calibration.cameras, drift.calibrated(calibration, 3e-4), rng)
+        true = drawn_check.drawn_rig(wrong, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
+        printed = circle_layout.with_lengths(
+            target, rng.multivariate_normal(circle_layout.lengths(target), circle_layout.length_covariance(target))
+        )
+        film = drawn_check.drawn_film(true, calibration.cameras, printed, 0.008, rng, 24)
+        found = drift.estimate(calibration, film, None, target, 3e-4, DRIFT_PX).after
+        volume = uncertainty.working_volume(found, [620.0, 680.0])
+        sigma = uncertainty.scale(found, "cam1", "cam2", volume)
+        assert sigma < 8e-5
+        seen = [true[name].project(volume) for name in ("cam1", "cam2")]
+        places = meet([found.cameras[name] for name in ("cam1", "cam2")], seen)[0]
+        modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
+        normal.append(np.linalg.lstsq(modes.reshape(-1, 7), (places - volume).ravel(), rcond=None)[0][-1] / sigma)
+    assert abs(np.mean(np.square(normal)) - 1) < 4 * np.sqrt(2 / 10)
+    by_cameras = drift.estimate(calibration, film, None, drift_step.with_open_scale(target), 3e-4, DRIFT_PX).after
+    assert uncertainty.scale(by_cameras, "cam1", "cam2", volume) > 2.9e-4
