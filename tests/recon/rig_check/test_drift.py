@@ -108,7 +108,7 @@ def test_mounts_move_the_devices_as_predicted(calibration, rng):
 
 
 def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
-    """By a microscope, to 0.002 mm of 25: from 3e-4 of a print to 5e-5, as predicted over ten rigs; one by cameras tells nothing."""
+    """By a microscope, to 0.002 mm of 25: 5e-5 in place of 3e-4, as predicted over ten rigs; one by cameras tells nothing."""
     target = rig.target.model_copy(update={"tolerance_mm": 0.002, "covariance_mm2": None})
     normal = []
     for seed in range(10):
