@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from recon.capture import calibration_files, manifest, stereo_frames, surface_part
 from recon.capture.manifest import CAMERAS, MANIFEST, Manifest
@@ -49,6 +49,12 @@ class Settings(MeasuredTargetFields):
     views: Annotated[int, Field(ge=0, le=1000)] = 24
     """pairs of frames, out of all films of the target, in which it is looked for; 0 leaves films out"""
 
+    @model_validator(mode="after")
+    def _drifts(self) -> "Settings":
+        if self.drift_px == 0:
+            raise ValueError("drift_px: expected more than 0, found 0, by which nothing drifts")
+        return self
+
 
 @dataclass(frozen=True)
 class Corrected:
@@ -77,16 +83,19 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.target, settings.networks))
     held = manifest.read_manifest(settings.capture)
     calibration = calibration_files.read_for(held.calibration_file(settings.capture, settings.calibration), sizes(held))
-    matches, fault = None, None
+    matches, film, faults = None, [], {}
     try:
         matches = match_fringes(settings, held, calibration, watch)
-    except InputError as found:
-        fault = found
-    film = look_at_target(settings, held, watch)
-    if fault is not None:
-        if not film:
+    except InputError as fault:
+        faults["fringes"] = fault
+    try:
+        film = look_at_target(settings, held, watch)
+    except InputError as fault:
+        faults["target"] = fault
+    for part, fault in faults.items():
+        if matches is None and not film:
             raise fault
-        watch.say(f"warning     fringes: not used, skin and target drift apart unseen: {fault}")
+        watch.say(f"warning     {part}: not used: {fault}")
     if matches is None and not film:
         expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
         raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
@@ -94,7 +103,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         found = correct(calibration, matches, film, target_of(settings), settings)
     if not found.is_drift:
         cause = (
-            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is for rigs that drift more"
+            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is of a rig that drifts more"
         )
         expected = f"expected devices that drifted by some {settings.drift_px:g} px since their calibration"
         raise InputError(f"{settings.capture}: {expected}, found {found.drift.size:.0f} times as much: {cause}")
