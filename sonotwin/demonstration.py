@@ -174,7 +174,7 @@ def compare(config: Config) -> Metrics:
     if config.poses is not None:
         found = calibration_files.read(result / "optics" / optics_step.OPTICS)
         figures |= metrics.read(result / "optics" / metrics.FILE) | session_errors.optics(found, truth)
-    if (result / "drift" / metrics.FILE).is_file():
+    if plan.is_corrected(result):
         figures |= _named(result / "drift", "drift")
     figures |= metrics.read(result / "surface" / metrics.FILE)
     # what evaluation predicts, in place of the surface's own, is of points that have a truth, by true normals
@@ -201,7 +201,7 @@ def report(config: Config, found: Figures) -> None:
     estimated = None if optics is None else calibration_files.read(optics)
     story = demo_report.read(out / CAPTURE, truth, result / "surface" / skin_step.POINTS, config.cameras[0], estimated)
     files, inside, tracked, fused = FILES | (FROM_BOARD if config.poses is not None else {}), None, None, None
-    files |= FROM_BOTH if (result / "drift").is_dir() else {}
+    files |= FROM_BOTH if plan.is_corrected(result) else {}
     if config.looks_inside:
         files |= FROM_SWEEPS
         expected = sweep_errors.read_truth(truth, SCAN)

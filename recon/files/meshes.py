@@ -48,7 +48,7 @@ def joined(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     places, normals = (np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "vertex_normals"))
     whole = trimesh.Trimesh(places, faces, vertex_normals=normals, process=False, validate=False)
-    for name in set.intersection(*(set(part.vertex_attributes) for part in parts)):
+    for name in [name for name in parts[0].vertex_attributes if all(name in part.vertex_attributes for part in parts)]:
         whole.vertex_attributes[name] = np.concatenate([part.vertex_attributes[name] for part in parts])
     greys = [greys_of(part) for part in parts]
     if len(shown := [grey for grey in greys if grey is not None]) == len(parts):

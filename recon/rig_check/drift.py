@@ -31,7 +31,7 @@ from recon.tracking.pose_fit import Sighting, meet
 Array = NDArray[np.float64]
 
 TURN_PER_PX, SHIFT_PER_PX = 3e-4, 0.2  # rad and mm of a mount for each px of drift; assumed: 15 urad and 10 um for 0.05 px
-SIZES = np.geomspace(1, 16, 17)  # of drift over the usual one, that are compared
+SIZES = 2.0 ** (np.arange(17) / 4)  # of drift over the usual one, that are compared
 LARGEST = 8.0  # of these, that is still drift: 0.4 px
 ROUNDS = 3  # of linearising anew: a drift of a tenth of a pixel is all but linear
 

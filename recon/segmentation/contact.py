@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from recon.estimation.covariance import propagate
 from recon.files.metrics import Metrics
@@ -19,7 +20,7 @@ from recon.segmentation.containment import below
 
 Array = NDArray[np.float64]
 
-PLACES = 9  # along the face
+PLACES, NEIGHBOURS = 45, 15  # along the face, a mm or so apart; and those that noise is smoothed over
 GEL_MM = 1.0  # of gel, that the face stands off at most without a word; assumed
 GIVEN_MM = 0.05  # standard deviation by which a bracket gives between wires and sweep; assumed: a printed one, pressed
 FEWEST = 5  # B-scans over the skin
@@ -35,10 +36,14 @@ class Contact:
     sigma_mm: float  # standard deviation of their median, by what errs alike in all; NaN where the calibration's isn't known
 
     @property
+    def count(self) -> int:
+        """Number of B-scans over the skin."""
+        return int(np.isfinite(self.distances_mm).sum())
+
+    @property
     def median_mm(self) -> float:
         """Median distance; NaN of too few."""
-        seen = self.distances_mm[np.isfinite(self.distances_mm)]
-        return float(np.median(seen)) if len(seen) >= FEWEST else np.nan
+        return float(np.nanmedian(self.distances_mm)) if self.count >= FEWEST else np.nan
 
     @property
     def range_mm(self) -> tuple[float, float]:
@@ -59,12 +64,12 @@ class Contact:
     def lines(self) -> list[str]:
         """A line, and a warning where the face doesn't meet the skin."""
         if np.isnan(self.median_mm):
-            return []
+            return [f"contact     of the array's face with the skin isn't known: over it in {self.count} B-scans"]
         low, high = self.range_mm
         known = f" ± {self.sigma_mm:.2f}" if np.isfinite(self.sigma_mm) else ""
         span = f"{low:+.2f} to {high:+.2f} in nine B-scans of ten"
         told = [f"contact     the array's face stands {self.median_mm:+.2f}{known} mm off the skin, {span}"]
-        most = ALARM_SIGMA * np.nan_to_num(self.sigma_mm)
+        most = ALARM_SIGMA * self.sigma_mm  # a comparison with NaN is no alarm
         if self.median_mm < -most:
             told.append(f"warning     contact: the face lies within the measured skin: {CAUSES}?")
         elif self.median_mm > GEL_MM + most:
@@ -79,23 +84,30 @@ def measure(scans: Scans, skin: trimesh.Trimesh) -> Contact:
     calibration has in it.
     """
     row = 0.0 if scans.probe is None else scans.probe.face_row
-    face = np.column_stack([np.linspace(0, scans.shape[1] - 1, PLACES), np.full(PLACES, row), np.zeros(PLACES), np.ones(PLACES)])
+    columns = np.linspace(0, scans.shape[1] - 1, PLACES)
+    face = np.column_stack([columns, np.full(PLACES, row), np.zeros(PLACES), np.ones(PLACES)])
     placed = np.flatnonzero(np.isfinite(scans.world_from_pixel).all(axis=(1, 2)))
-    distances, nearest, normals = (
-        np.full(len(scans.world_from_pixel), np.nan),
-        np.zeros(len(placed), int),
-        np.zeros((len(placed), 3)),
-    )
-    if not len(placed):
-        return Contact(distances, np.nan)
     places = np.einsum("nij,mj->nmi", scans.world_from_pixel[placed], face)[..., :3]
-    depths, towards, _ = below(places.reshape(-1, 3), skin)
-    off = -depths.reshape(len(placed), PLACES)
-    over = np.isfinite(off).any(axis=1)
-    nearest[over] = np.nanargmin(off[over], axis=1)
-    normals = towards.reshape(len(placed), PLACES, 3)[np.arange(len(placed)), nearest]
-    distances[placed[over]] = np.nanmin(off[over], axis=1)
-    return Contact(distances, _sigma(scans, placed[over], face[nearest[over], :2], normals[over]))
+    depths, towards, _ = below(places.reshape(-1, 3), skin) if len(placed) else (np.empty(0), np.empty((0, 3)), None)
+    heights = _smoothed(-depths.reshape(-1, PLACES))
+    over = np.isfinite(heights).any(axis=1)
+    nearest = np.nanargmin(heights[over], axis=1)
+    distances = np.full(len(scans.world_from_pixel), np.nan)
+    distances[placed[over]] = np.nanmin(heights[over], axis=1)
+    normals = towards.reshape(-1, PLACES, 3)[np.flatnonzero(over), nearest]
+    return Contact(distances, _sigma(scans, placed[over], face[nearest, :2], normals))
+
+
+def _smoothed(heights: Array) -> Array:
+    """Heights : (n, m) mm along the face, by parabolas through some neighbours where all are known.
+
+    The least of many noisy numbers is less than the least of what they are of.
+    """
+    known = np.isfinite(heights).all(axis=1)
+    smooth = heights.copy()
+    if known.any():
+        smooth[known] = savgol_filter(heights[known], NEIGHBOURS, 2, axis=1)
+    return smooth
 
 
 def _sigma(scans: Scans, used: NDArray[np.intp], pixels: Array, normals: Array) -> float:

@@ -1,7 +1,7 @@
 """Drift of cameras and projector since their calibration, corrected by what the session shows of it: settings, step and files."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,18 +23,19 @@ from recon.optical_calibration import uncertainty
 from recon.reports import page
 from recon.reports.page import Opening, Section
 from recon.rig_check import drift, fringe_matches
-from recon.rig_check.drift import LARGEST, Drift
+from recon.rig_check.drift import LARGEST, SIZES, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
-from recon.tracking.pose_fit import Sighting, meet
+from recon.tracking.pose_fit import Sighting
 
 BY = "correct-optics"  # who writes
 OPTICS, PAGE = "optics.yaml", "drift.html"
 OPEN_SCALE = 0.01  # relative standard deviation of lengths that tell nothing of the scale
+SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
 SEED = 0  # of the points under the fringes
 SHOWN = ("cx", "cy", "fx", "rx", "ry", "rz", "tx", "ty", "tz")  # parameters that a device's drift is told by
 
@@ -66,9 +67,22 @@ class Corrected:
     figures: Metrics
 
     @property
+    def calibration(self) -> Calibration:
+        """The corrected one; without a covariance where it had none, by which single errors would count as known."""
+        return replace(self.drift.after, uncertainty=self.drift.after.uncertainty if self.drift.before.uncertainty else None)
+
+    @property
     def is_drift(self) -> bool:
         """Whether no device moved by more than drift."""
         return self.drift.size <= LARGEST
+
+    def beyond(self, drift_px: float) -> str:
+        """A fault: more than drift."""
+        size = f"{self.drift.size:.0f} times as much{' or more' if self.drift.size == SIZES[-1] else ''}"
+        cause = (
+            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is of a rig that drifts more"
+        )
+        return f"expected devices that drifted by some {drift_px:g} px since their calibration, found {size}: {cause}"
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
@@ -83,34 +97,21 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.target, settings.networks))
     held = manifest.read_manifest(settings.capture)
     calibration = calibration_files.read_for(held.calibration_file(settings.capture, settings.calibration), sizes(held))
-    matches, film, faults = None, [], {}
-    try:
-        matches = match_fringes(settings, held, calibration, watch)
-    except InputError as fault:
-        faults["fringes"] = fault
-    try:
-        film = look_at_target(settings, held, watch)
-    except InputError as fault:
-        faults["target"] = fault
-    for part, fault in faults.items():
-        if matches is None and not film:
-            raise fault
-        watch.say(f"warning     {part}: not used: {fault}")
+    if calibration.uncertainty is None:
+        watch.say("warning     no covariance in the calibration: its errors count as drift, and what is left of both isn't known")
+    matches = match_fringes(settings.capture, settings.calibration, held, calibration, watch)
+    film = look_at_target(settings, held, watch)
     if matches is None and not film:
         expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
         raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
     with watch.busy("estimating the drift"):
         found = correct(calibration, matches, film, target_of(settings), settings)
     if not found.is_drift:
-        cause = (
-            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is of a rig that drifts more"
-        )
-        expected = f"expected devices that drifted by some {settings.drift_px:g} px since their calibration"
-        raise InputError(f"{settings.capture}: {expected}, found {found.drift.size:.0f} times as much: {cause}")
+        raise InputError(f"{settings.capture}: {found.beyond(settings.drift_px)}")
     for line in describe(found):
         watch.say(line)
     with atomic.new_folder(out, BY) as folder:
-        calibration_files.write(folder / OPTICS, found.drift.after)
+        calibration_files.write(folder / OPTICS, found.calibration)
         metrics.write(folder / metrics.FILE, found.figures)
         (folder / PAGE).write_text(write_page(found, held.name or settings.capture.resolve().name), encoding="utf-8")
     watch.say(f"wrote       {out}/{{{OPTICS},{PAGE},{metrics.FILE}}}")
@@ -129,9 +130,7 @@ def correct(
     """
     known = target if settings.target is None else with_open_scale(target)
     found = drift.estimate(calibration, film or None, matches, known, settings.board_scale, settings.drift_px)
-    lit = [] if matches is None else [points_by_light(matches.pixels, matches.first, matches.axes, found.after.cameras)]
-    seen = [meet([found.after.cameras[name] for name in CAMERAS], [view.centres for view in pair])[0] for pair in film]
-    return Corrected(found, matches, len(film), measure(found, matches, len(film), np.concatenate([*lit, *seen])))
+    return Corrected(found, matches, len(film), measure(found, matches, len(film)))
 
 
 def with_open_scale(target: Target) -> Target:
@@ -146,8 +145,10 @@ def sizes(held: Manifest) -> dict[str, tuple[int, int]]:
     return {name: device.size for name, device in held.devices.items() if name in (*CAMERAS, PROJECTOR)}
 
 
-def match_fringes(settings: Settings, held: Manifest, calibration: Calibration, watch: Watch) -> Matches | None:
+def match_fringes(capture: Path, file: Path | None, held: Manifest, calibration: Calibration, watch: Watch) -> Matches | None:
     """Points of the skin that both cameras see under the fringes; says why where the capture has none, and returns None.
+
+    file : of the calibration, which takes the place of the capture's own
 
     Raises
     ------
@@ -163,11 +164,11 @@ def match_fringes(settings: Settings, held: Manifest, calibration: Calibration, 
         return None
     maps = []
     for camera in CAMERAS:
-        shots = surface_part.read_surface(settings.capture, camera, settings.calibration)
+        shots = surface_part.read_surface(capture, camera, file)
         name = f"{shots.name}: {camera}"
         maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=name, camera=camera))
     given = (maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED)
-    matches = fringe_matches.match(*given, str(settings.capture))
+    matches = fringe_matches.match(*given, str(capture))
     axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
     watch.say(f"fringes     {len(matches.pixels)} points in both cameras, {axes}")
     return matches
@@ -175,15 +176,17 @@ def match_fringes(settings: Settings, held: Manifest, calibration: Calibration, 
 
 def look_at_target(settings: Settings, held: Manifest, watch: Watch) -> list[tuple[Sighting, Sighting]]:
     """Views of the target by both cameras, in poses that differ, evenly out of all films."""
-    names = [name for name, part in held.sweeps.items() if set(CAMERAS) <= part.images.keys()] if settings.views else []
+    swept = held.named_sweeps.items() if settings.views else ()
+    names = [name for name, part in swept if set(CAMERAS) <= part.images.keys()]
     films = [stereo_frames.read_film(settings.capture, settings.calibration, name) for name in names]
     total = sum(len(film.times) for film in films)
     chosen = np.unique(np.linspace(0, total - 1, min(settings.views, total)).round().astype(int))
     seen, target, first = [], target_of(settings), 0
+    wide = settings.model_copy(update={"drift_px": SEARCH_PX})
     for film in films:
         some = film.some(chosen[(chosen >= first) & (chosen < first + len(film.times))] - first)
         first += len(film.times)
-        tracker = make_tracker(settings, target, film.cameras, film.optics, film.bits)
+        tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
         pairs = watch.follow(some.pairs(), len(some.times), "looking at the target")
         found = (each for _, each in poses_step.follow(tracker, some.times, pairs))
         seen += target_poses.collect(found, film.cameras).seen
@@ -193,8 +196,8 @@ def look_at_target(settings: Settings, held: Manifest, watch: Watch) -> list[tup
     return kept
 
 
-def measure(found: Drift, matches: Matches | None, views: int, points: Array) -> Metrics:
-    """Figures of a correction."""
+def measure(found: Drift, matches: Matches | None, views: int) -> Metrics:
+    """Figures of a correction; of the skin, by its columns, or rows, alone, where fringes were matched."""
     figures: Metrics = {
         "matches": 0 if matches is None else len(matches.pixels),
         "views": views,
@@ -203,8 +206,9 @@ def measure(found: Drift, matches: Matches | None, views: int, points: Array) ->
     }
     for name, (change, sigma) in changes(found).items():
         figures |= {f"{name.replace('.', '_')}_change": change, f"{name.replace('.', '_')}_sigma": sigma}
-    if PROJECTOR in found.after.cameras:
-        axes = (0,) if matches is None else matches.axes
+    if matches is not None:
+        axes = matches.axes[:1]
+        points = points_by_light(matches.pixels, matches.first, axes, found.after.cameras)
         before = Calibration(found.before.cameras, found.prior)
         figures |= {
             "skin_moved_mm": float(np.sqrt(np.mean(np.sum(drift.parted(found, points, axes) ** 2, axis=1)))),
@@ -257,11 +261,12 @@ def write_page(found: Corrected, name: str) -> str:
             if f"{device}.{parameter}" in told:
                 change, sigma = told[f"{device}.{parameter}"]
                 rows.append((device, LABELS[parameter], f"{factor * change:+.3f} {unit}", f"{factor * sigma:.3f} {unit}"))
-    blocks = [page.table(("device", "parameter", "change", "1 σ"), rows)]
+    blocks = [page.table(("device", "parameter", "change", "1 σ of the value"), rows)]
     lines = [page.paragraph(line) for line in READING]
     sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
     figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
-    result = "The calibration holds as it was, within usual drift." if found.drift.size == 1 else "More than usual drift."
+    usual = found.drift.size == 1
+    result = "Devices drifted as usual, or less." if usual else f"Devices drifted {found.drift.size:.1f} times as far as usual."
     if "skin_moved_mm" in found.figures:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]
         figures += [("skin from target, uncorrected", f"{moved:.3f}", "mm"), ("left, 1 σ", f"{left:.3f}", "mm")]
@@ -274,6 +279,6 @@ LABELS |= {f"r{axis}": f"turn about {axis}" for axis in "xyz"} | {f"t{axis}": f"
 READING = (
     "Estimated together with all other errors of the calibration, whose covariance is known. Single parameters stay uncertain "
     "where others do the same to the images; what all do together to the skin, beside the target, is in the figures above.",
-    "A common motion of all devices, and a common change of scale, show nowhere.",
+    "A common motion of all devices shows nowhere, and a change of scale by a target of known lengths alone.",
 )
 FOOTER = "This file is complete: it fetches nothing."

@@ -17,6 +17,7 @@ from recon.model.rig import Finite, NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
+from recon.rig_check.optics_equations import PROJECTOR
 from recon.session import (
     drift_step,
     latency_step,
@@ -38,7 +39,8 @@ from recon.tracking import networks
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
 NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
 NO_LAG = "latency failed; give lag_s"
-CAUSE = "what drifted since the calibration, and parts skin and target by a tenth of a millimetre, is corrected"
+WITH_BOTH = "with those of both cameras it is corrected, which parts skin and target by a tenth of a millimetre"
+WITHIN = 0.2  # of usual drift, that devices drift within a session: fringes and films were taken at other moments; assumed
 Command = Callable[[optics_step.Settings, Path], str]
 
 
@@ -131,10 +133,7 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
         calibrated = calibrate_optics(steps, sources)
         optics = correct_optics(steps, sources, calibrated)
         skin = measure_skin(steps, sources, optics)
-        drift_px = (
-            settings.drift_px if optics == calibrated else 0.0
-        )  # a corrected calibration has what is left in its covariance
-        tracked = {name: track_sweep(steps, sources, name, optics, drift_px) for name in sources.sweeps}
+        tracked = {name: track_sweep(steps, sources, name, optics, optics != calibrated) for name in sources.sweeps}
         lag = measure_latency(steps, sources, tracked)
         probe = calibrate_probe(steps, sources, tracked, lag)
         for name, part in sources.sweeps.items():
@@ -211,8 +210,12 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
     lit = held.surface is not None and set(CAMERAS) <= held.surface.images.keys()
     if optics is None or held.surface is None or settings.drift_px == 0:
         return optics
+    known = calibration_files.read(optics).cameras
+    if missing := [name for name in (*CAMERAS, PROJECTOR) if name not in known]:
+        steps.leave_out("drift", f"no calibration of {' and '.join(missing)}")
+        return optics
     if not lit:
-        steps.leave_out("drift", f"fringes before one camera alone; with those of both {CAUSE}")
+        steps.leave_out("drift", f"fringes before one camera alone; {WITH_BOTH}")
         return optics
     same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks")
     fields = {field: getattr(settings, field) for field in same} | {"calibration": optics}
@@ -242,8 +245,11 @@ def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | 
     return None if made is None else made / skin_step.SKIN
 
 
-def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, drift_px: float) -> Path | None:
-    """Track the target in a sweep's frames; returns a capture in which it has poses, the sweep's own where it has a track."""
+def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, corrected: bool) -> Path | None:
+    """Track the target in a sweep's frames; returns a capture in which it has poses, the sweep's own where it has a track.
+
+    corrected : whether the calibration is one for drift, with a covariance that has the board's scale
+    """
     settings, part, step = sources.settings, sources.sweeps[name], _step_of("poses", name)
     filmed = set(CAMERAS) <= part.images.keys()
     if part.track is not None and (optics is None or not filmed):
@@ -252,9 +258,10 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, 
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
-    same = ("rig", "capture", "naming", "board_scale", "target", "networks", "overlays")
-    fields = {field: getattr(settings, field) for field in same}
-    fields |= {"sweep": name, "calibration": optics, "drift_px": drift_px}
+    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
+    fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
+    if corrected and calibration_files.read(optics).uncertainty is not None:
+        fields |= {"drift_px": WITHIN * settings.drift_px, "board_scale": 0.0}
     weights = settings.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
@@ -286,6 +293,11 @@ def optics_used(out: Path) -> Path | None:
     done = json_text.read(out / store.RECORD)
     files = {"drift": drift_step.OPTICS, "optics": optics_step.OPTICS}
     return next((out / step / file for step, file in files.items() if step in done), None)
+
+
+def is_corrected(out: Path) -> bool:
+    """Whether all in a folder of results was measured by a calibration corrected for drift."""
+    return "drift" in json_text.read(out / store.RECORD)
 
 
 def read_lag(folder: Path) -> KnownLag:

@@ -132,14 +132,16 @@ def reconstruct(
         raw = triangulate(found, implausible)
         ray_checks.check(found, raw, by, projector, shots.name, implausible)
     with clock.stage("second_view"):
-        views = list(beside(shots, others or {}, found, raw, implausible, watch))
-        joined = [second_view.fuse(View(by, found, raw), view, projector) for view in views]
-        for view, fused in zip(views, joined, strict=True):
-            raw = fused.points
+        added = []
+        for view in beside(shots, others or {}, found, raw, implausible, watch):
+            fused = second_view.fuse(View(by, found, raw), view, projector)
             watch.say(describe_fusion(view, fused))
+            raw = fused.first
+            if fused.shared.any():
+                added.append(view._replace(raw=fused.second))
     skin = surface_of(found, raw, by, limits, shots.name, clock)
     with clock.stage("seen_alone"):
-        skin = with_more(skin, by, [view for view, fused in zip(views, joined, strict=True) if fused.shared.any()], limits)
+        skin = with_more(skin, by, added, limits)
     figures = skin.figures
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     watch.say(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
@@ -193,27 +195,30 @@ def beside(
             continue
         try:
             its = read_its()
+            camera, projector = its.calibration.cameras[name], its.calibration.cameras["projector"]
             other = decode.decode(its.images, its.patterns, bits=its.bits, name=f"{its.name}: {name}", camera=name)
+            points = Triangulator(camera, projector)(other, implausible)
         except InputError as fault:
             watch.say(f"compare     {name} isn't compared: {fault}")
             continue
-        camera = its.calibration.cameras[name]
         alike = ray_checks.check_beside(found, raw, other, camera, shots.name, implausible)
-        if np.isfinite(alike):
-            watch.say(f"compare     {name} sees {100 * alike:.0f} % of the points alike")
-            yield View(camera, other, Triangulator(camera, its.calibration.cameras["projector"])(other, implausible))
+        if np.isnan(alike):
+            watch.say(f"compare     {name} isn't compared: both see too few points in common")
+            continue
+        watch.say(f"compare     {name} sees {100 * alike:.0f} % of the points alike")
+        yield View(camera, other, points)
 
 
 def describe_fusion(view: View, fused: Fused) -> str:
     """A line: the points that another camera improves, or why it improves none."""
+    name = view.camera.name
     if fused.shared.any():
         both, apart = (f"{np.count_nonzero(mask):,}".replace(",", " ") for mask in (fused.shared, fused.apart))
-        return f"fuse        {view.camera.name} measures {both} points, too; {apart} left out, on which both disagree"
+        return f"fuse        {name} measures {both} points, too; {apart} left out, through which one of both sees"
     if np.isnan(fused.bias_px):
-        return f"fuse        {view.camera.name} improves no point: both cameras see too few alike"
-    cause = "devices that drifted since their calibration? sonotwin correct-optics corrects it"
-    parts = f"the calibration parts both by {fused.bias_px:.2f} projector px"
-    return f"warning     {view.camera.name} improves no point: {parts}: {cause}"
+        return f"fuse        {name} improves no point: both cameras see too few alike"
+    cause = "devices that drifted, which sonotwin correct-optics corrects, or another calibration?"
+    return f"warning     {name} improves no point: the calibration parts both by {fused.bias_px:.2f} projector px: {cause}"
 
 
 def with_more(skin: Skin, camera: Camera, views: Sequence[View], limits: Limits) -> Skin:

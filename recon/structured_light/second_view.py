@@ -1,9 +1,10 @@
 """A surface by three devices: points of one camera, improved by another that sees the same fringes, and what that sees alone.
 
-A point of the first camera lies where its ray meets the projector's column. There the second camera must see that column, too.
-Where it does, the point is moved along the ray to where both measurements, weighed by their noise, agree best. Where it doesn't,
-beyond noise, one of the three was deceived: by gloss, light from elsewhere, an edge or a wrong fringe order. The point is left
-out.
+A point of the first camera lies where its ray meets the projector's column. There the second camera sees that column, too, if
+nothing hides the point: then the point is moved along the ray to where both measurements, weighed by their noise, agree best. If
+it sees a nearer point, that hides the first one, which stays as it is. If it sees a farther one, it sees through the point: one
+was deceived, by gloss, light from elsewhere, an edge or a wrong fringe order, and nobody knows which. Both cameras' points there
+are left out.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NOTHING = np.empty((0, 0), np.float32)  # in place of an axis that isn't decoded
+UNSEEN, AGREES, HIDDEN, THROUGH = range(4)  # what the second camera says of a point
+EXACT = 1e-6  # mm and projector px: standard deviation of what claims to be perfect
 
 
 class View(NamedTuple):
@@ -32,15 +35,22 @@ class View(NamedTuple):
     found: ProjectorMap
     raw: PointMap  # not cleaned
 
+    def less(self, gone: Mask) -> "View":
+        """The same without some of its points."""
+        points, sigma = self.raw.points.copy(), self.raw.sigma.copy()
+        points[gone] = sigma[gone] = np.nan
+        return self._replace(raw=PointMap(points, sigma))
+
 
 @dataclass(frozen=True)
 class FusionLimits:
     """When two cameras see the same."""
 
     apart_sigma: float = 5.0  # beyond which, and
-    apart_px: float = 0.1  # projector px, beyond which a point is left out
+    apart_px: float = 0.1  # projector px, beyond which both see different points
     block: int = 32  # px of camera 1, over which errors of the calibration are alike
     least: int = 64  # points of a block that count
+    far_px: float = 2.0  # projector px: beyond, it isn't the calibration that parts both
     bias_px: float = 0.05  # projector px, in one block of ten, from which on calibrations contradict each other
     reach_mm: float = 0.5  # along a ray, to both sides, over which slopes are taken: some pixels, so that noise hardly turns them
     beside_mm: float = 2.0  # from a point to another camera's in the same pixel, within which they are one surface's
@@ -51,42 +61,54 @@ LIMITS = FusionLimits()
 
 @dataclass(frozen=True)
 class Fused:
-    """Points of the first camera."""
+    """Points of both cameras."""
 
-    points: PointMap  # improved, less those that disagree
-    shared: Mask  # (h, w) that both cameras measured alike
-    apart: Mask  # (h, w) that they measured differently, left out
-    bias_px: (
-        float  # projector px by which calibrations contradict each other, exceeded in one block of ten; NaN of too few points
-    )
+    first: PointMap  # improved, less those that are seen through
+    second: PointMap  # as it was, less the same
+    shared: Mask  # (h, w) of the first, that both cameras measured alike
+    apart: Mask  # (h, w) of the first, left out
+    bias_px: float  # projector px by which calibrations part both in one block of ten; NaN of too few points
 
 
 def fuse(first: View, second: View, projector: Camera, limits: FusionLimits = LIMITS) -> Fused:
     """Improve the points of a camera by another's view of the same fringes.
 
     Linear least squares along the camera's ray: the projector's column holds the point to its sigma; the second camera's map,
-    less the projector's column of the point, is to be zero there. Nothing is changed where calibrations contradict each other by
-    more than `limits.bias_px`.
+    less the projector's column of the point, is to be zero there. Nothing is changed where calibrations part both by more than
+    `limits.bias_px`, beyond noise.
     """
-    points, sigma = first.raw.points, first.raw.sigma
-    made, noises = points.copy(), sigma.copy()
-    misses, apart = np.full(sigma.shape, np.nan, np.float32), np.zeros(sigma.shape, np.bool_)
-    maps = []
-    for mine, (image, noise) in zip(_axes(first.found), _axes(second.found), strict=True):
-        known = mine[0] is not None and image is not None
-        maps += [np.float32(image if known else NOTHING), np.float32(NOTHING if noise is None or not known else noise)]
-    devices = [(camera.camera_from_world, camera.matrix, camera.coefficients) for camera in (second.camera, projector)]
-    rules = Rules(limits.reach_mm, limits.apart_sigma, limits.apart_px)
-    centre = np.ascontiguousarray(first.camera.centre)
-    in_threads(_fuse, len(points), points, sigma, centre, *devices, tuple(maps), rules, made, noises, misses, apart)
-    bias = _bias(misses, limits)
+    mine, its = _compare(first, second, projector, limits), _compare(second, first, projector, limits)
+    bias = _bias(mine.misses, mine.expected, limits)
     if not bias <= limits.bias_px:
-        none = np.zeros(sigma.shape, bool)
-        return Fused(first.raw, none, none, bias)
-    return Fused(PointMap(made, noises), np.isfinite(misses) & ~apart, apart, bias)
+        none = np.zeros(mine.verdicts.shape, bool)
+        return Fused(first.raw, second.raw, none, none, bias)
+    gone, its_gone = mine.verdicts == THROUGH, its.verdicts == THROUGH
+    gone, its_gone = gone | _about(its.places[its_gone], gone.shape), its_gone | _about(mine.places[gone], its_gone.shape)
+    shared = (mine.verdicts == AGREES) & ~gone
+    points = np.where(shared[..., None], mine.points, first.raw.points)
+    better = View(first.camera, first.found, PointMap(points, np.where(shared, mine.sigma, first.raw.sigma))).less(gone)
+    return Fused(better.raw, second.less(its_gone).raw, shared, gone & np.isfinite(first.raw.points[..., 0]), bias)
 
 
-class Rules(NamedTuple):
+def _about(places: NDArray[np.int64], shape: tuple[int, ...]) -> Mask:
+    """Pixels at flat places and those about them, between which a map is read, as an image."""
+    image = np.zeros(shape, bool)
+    image.ravel()[places] = True
+    return ndimage.binary_dilation(image, np.ones((3, 3), bool))
+
+
+class _Compared(NamedTuple):
+    """What a second camera says of the points of a first, in the first one's pixels."""
+
+    verdicts: NDArray[np.uint8]  # (h, w)
+    places: NDArray[np.int64]  # (h, w) the nearest pixel of the second, flat
+    points: NDArray[np.float32]  # (h, w, 3) mm, improved
+    sigma: NDArray[np.float32]  # (h, w) mm
+    misses: NDArray[np.float32]  # (h, w) projector px that the second's map is off, of the first axis that both have
+    expected: NDArray[np.float32]  # (h, w) projector px, standard deviation of these
+
+
+class _Rules(NamedTuple):
     """Of `FusionLimits`, for compiled code."""
 
     reach_mm: float
@@ -94,8 +116,27 @@ class Rules(NamedTuple):
     apart_px: float
 
 
+def _compare(first: View, second: View, projector: Camera, limits: FusionLimits) -> _Compared:
+    points, sigma = first.raw.points, first.raw.sigma
+    shape = sigma.shape
+    maps = []
+    for mine, (image, noise) in zip(_axes(first.found), _axes(second.found), strict=True):
+        known = mine[0] is not None and image is not None
+        maps += [np.float32(image if known else NOTHING), np.float32(NOTHING if noise is None or not known else noise)]
+    devices = [(camera.camera_from_world, camera.matrix, camera.coefficients) for camera in (second.camera, projector)]
+    eyes = np.stack([first.camera.centre, second.camera.centre])
+    away = np.linalg.norm(second.raw.points - second.camera.centre.astype(np.float32), axis=-1)
+    rules = _Rules(limits.reach_mm, limits.apart_sigma, limits.apart_px)
+    unknown = np.full((2, *shape), np.nan, np.float32)
+    found = _Compared(np.zeros(shape, np.uint8), np.zeros(shape, np.int64), points.copy(), sigma.copy(), *unknown)
+    in_threads(_compare_rows, len(points), points, sigma, away, eyes, *devices, tuple(maps), rules, *found)
+    return found
+
+
 @kernel
-def _fuse(first, end, points, sigma, centre, camera, projector, maps, rules, made, noises, misses, apart):
+def _compare_rows(
+    first, end, points, sigma, away, eyes, camera, projector, maps, rules, verdicts, places, made, noises, misses, expected
+):
     """Rows `first` to `end` (not included)."""
     columns, sigma_columns, rows, sigma_rows = maps
     for j in range(first, end):
@@ -103,7 +144,7 @@ def _fuse(first, end, points, sigma, centre, camera, projector, maps, rules, mad
             x, y, z = np.float64(points[j, i, 0]), np.float64(points[j, i, 1]), np.float64(points[j, i, 2])
             if not np.isfinite(x):
                 continue
-            dx, dy, dz = x - centre[0], y - centre[1], z - centre[2]
+            dx, dy, dz = x - eyes[0, 0], y - eyes[0, 1], z - eyes[0, 2]
             reach = rules.reach_mm / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = reach * dx, reach * dy, reach * dz
             u0, v0 = _pixel(x - dx, y - dy, z - dz, camera)
@@ -113,8 +154,8 @@ def _fuse(first, end, points, sigma, centre, camera, projector, maps, rules, mad
             s, t = _pixel(x, y, z, projector)
             s1, t1 = _pixel(x + dx, y + dy, z + dz, projector)
             doubt = np.float64(sigma[j, i])
-            own = 1 / (doubt * doubt) if doubt > 0 else (1.0 if np.isnan(doubt) else 1e18)
-            information, right, miss = own, 0.0, np.nan
+            own = 1 / max(doubt, EXACT) ** 2 if doubt >= 0 else (s1 - s0) ** 2 / (2 * rules.reach_mm) ** 2  # of 1 px, as unknown
+            information, right, miss, alike = own, 0.0, np.nan, True
             for axis in range(2):
                 if axis == 0:
                     image, noise, before, here, after = columns, sigma_columns, s0, s, s1
@@ -125,22 +166,29 @@ def _fuse(first, end, points, sigma, centre, camera, projector, maps, rules, mad
                 its = _read(noise, u, v)
                 if np.isnan(left) or np.isnan(slope):
                     continue
-                variance = max(its * its * _averaged(u) * _averaged(v), 1e-12) if np.isfinite(its) else 1.0
+                variance = max(its * its * _averaged(u) * _averaged(v), EXACT**2) if np.isfinite(its) else 1.0
                 information += slope * slope / variance
                 right -= slope * left / variance
+                usual = np.sqrt(variance + slope * slope / own)
                 if np.isnan(miss):
                     miss = left
-                most = rules.apart_px + rules.apart_sigma * np.sqrt(variance + slope * slope / own)
-                apart[j, i] = apart[j, i] or abs(left) > most
-            misses[j, i] = miss
+                    expected[j, i] = usual
+                alike = alike and abs(left) <= rules.apart_px + rules.apart_sigma * usual
             if np.isnan(miss):
                 continue
+            misses[j, i] = miss
+            row, column = int(v + 0.5), int(u + 0.5)
+            places[j, i] = row * away.shape[1] + column
+            if not alike and np.isnan(away[row, column]):
+                continue
+            if not alike:
+                distance = np.sqrt((x - eyes[1, 0]) ** 2 + (y - eyes[1, 1]) ** 2 + (z - eyes[1, 2]) ** 2)
+                verdicts[j, i] = HIDDEN if away[row, column] < distance else THROUGH
+                continue
+            verdicts[j, i] = AGREES
             step = right / information / rules.reach_mm
-            bad = apart[j, i]
-            made[j, i, 0] = np.nan if bad else x + step * dx
-            made[j, i, 1] = np.nan if bad else y + step * dy
-            made[j, i, 2] = np.nan if bad else z + step * dz
-            noises[j, i] = np.nan if bad or np.isnan(doubt) else 1 / np.sqrt(information)
+            made[j, i, 0], made[j, i, 1], made[j, i, 2] = x + step * dx, y + step * dy, z + step * dz
+            noises[j, i] = np.nan if np.isnan(doubt) else 1 / np.sqrt(information)
 
 
 @njit(inline="always", error_model="numpy")
@@ -188,12 +236,9 @@ def alone(second: View, points: PointMap, camera: Camera, limits: FusionLimits =
         inside = ((at >= 0) & (at < [width, height])).all(axis=1)
     u, v = np.where(inside[:, None], at, 0).astype(int).T
     with np.errstate(invalid="ignore"):
-        covered = inside & (np.linalg.norm(points.points[v, u] - places, axis=1) < limits.beside_mm)
-    kept = _image(covered, rows, columns, second.raw.points.shape[:2])
-    inner = ndimage.binary_erosion(kept, np.ones((3, 3), bool))
-    made, noises = second.raw.points.copy(), second.raw.sigma.copy()
-    made[inner] = noises[inner] = np.nan
-    return PointMap(made, noises)
+        covered = np.zeros(second.raw.sigma.shape, bool)
+        covered[rows, columns] = inside & (np.linalg.norm(points.points[v, u] - places, axis=1) < limits.beside_mm)
+    return second.less(ndimage.binary_erosion(covered, np.ones((3, 3), bool))).raw
 
 
 def _axes(found: ProjectorMap) -> tuple[tuple[NDArray | None, NDArray | None], ...]:
@@ -201,17 +246,20 @@ def _axes(found: ProjectorMap) -> tuple[tuple[NDArray | None, NDArray | None], .
     return (found.columns, found.sigma_columns), (found.rows, found.sigma_rows)
 
 
-def _bias(misses: NDArray[np.float32], limits: FusionLimits) -> float:
-    """Absolute median in blocks of the image, exceeded in one of ten; NaN of too few points."""
+def _bias(misses: NDArray[np.float32], expected: NDArray[np.float32], limits: FusionLimits) -> float:
+    """Absolute median in blocks of the image, less three of its standard deviations, exceeded in one of ten; NaN of too few."""
     height, width = (length // limits.block * limits.block for length in misses.shape)
-    blocks = misses[:height, :width].reshape(height // limits.block, limits.block, width // limits.block, limits.block)
-    blocks = blocks.swapaxes(1, 2).reshape(-1, limits.block**2)
-    blocks = blocks[np.isfinite(blocks).sum(axis=1) >= limits.least]
-    return float(np.quantile(np.abs(np.nanmedian(blocks, axis=1)), 0.9)) if len(blocks) else np.nan
-
-
-def _image(mask: Mask, rows: NDArray, columns: NDArray, shape: tuple[int, ...]) -> Mask:
-    """A mask of pixels as an image."""
-    image = np.zeros(shape[:2], bool)
-    image[rows, columns] = mask
-    return image
+    if not height or not width:
+        return np.nan
+    blocks = []
+    for image in (np.where(np.abs(misses) < limits.far_px, misses, np.nan), expected):
+        cut = image[:height, :width].reshape(height // limits.block, limits.block, width // limits.block, limits.block)
+        blocks.append(cut.swapaxes(1, 2).reshape(-1, limits.block**2))
+    count = np.isfinite(blocks[0]).sum(axis=1)
+    used = count >= limits.least
+    if not used.any():
+        return np.nan
+    medians, noise = np.abs(np.nanmedian(blocks[0][used], axis=1)), np.nanmedian(blocks[1][used], axis=1)
+    shared_px = 4  # pixels of the second camera between which a map is read: so many misses share their noise
+    sigma = np.sqrt(np.pi / 2) * noise / np.sqrt(count[used] / shared_px)
+    return float(np.quantile(np.fmax(medians - 3 * sigma, 0), 0.9))

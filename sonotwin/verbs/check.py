@@ -18,7 +18,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, surface_part, sweep_part
+from recon.capture import calibration_files, lag_files, manifest, probe_files, stereo_frames, sweep_part
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.errors import Implausible, InputError
 from recon.files import atomic
@@ -26,24 +26,20 @@ from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
-from recon.rig_check import bottom_equations, check_log, check_page, fringe_matches, verdicts
+from recon.rig_check import bottom_equations, check_log, check_page, verdicts
 from recon.rig_check.bottom_equations import Known
-from recon.rig_check.drift import Drift
-from recon.rig_check.optics_equations import PROJECTOR, Matches
+from recon.rig_check.optics_equations import PROJECTOR
 from recon.rig_check.verdicts import Optics, Verdict
 from recon.session import drift_step, poses_step
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
-from recon.structured_light import decode
 from recon.target_calibration import target_poses
 from recon.tracking import track_figures
 from recon.tracking.pose_fit import Sighting
 from sonotwin.console_watch import ConsoleWatch
 
 CHECK, PAGE = "check.json", "check.html"
-SEARCH_PX = 5.0  # of the cameras' principal points: the tracker is to find the target by cameras that have moved, too
 UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
 LEAST_POSES = 3
-SEED = 0  # of the points under the fringes
 
 
 class Config(MeasuredTargetFields):
@@ -115,7 +111,7 @@ def run(config: Config) -> int:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
         if corrected is not None:
-            calibration_files.write(folder / drift_step.OPTICS, corrected.after)
+            calibration_files.write(folder / drift_step.OPTICS, corrected)
         if config.log is not None:  # last, so that whatever fails leaves both as they were
             check_log.add(config.log, made)
     watch.say(f"wrote       {config.out}/{{{','.join([CHECK, PAGE, *([drift_step.OPTICS] if corrected else [])])}}}")
@@ -166,7 +162,7 @@ def left_out(held: Held) -> list[str]:
     return [f"{name:12}{way}" for name, (lacking, way) in ways.items() if lacking]
 
 
-def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> tuple[list[Verdict], Drift | None]:
+def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> tuple[list[Verdict], Calibration | None]:
     """Verdicts on cameras, projector and target, and the calibration corrected for drift, where they show no more than drift."""
     if held.film is None and not held.fringes:
         return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")], None
@@ -178,7 +174,7 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
         watch.say(f"warning     {file}: no covariance: an error of the calibration is taken for a motion")
     target = target_of(config)
     film = None if held.film is None else filmed(config, held.film, target, calibration, watch)
-    matches = matched(config, calibration, watch) if held.fringes else None
+    matches = drift_step.match_fringes(config.capture, config.calibration, listed, calibration, watch) if held.fringes else None
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
@@ -188,7 +184,10 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
     corrected = drift_step.correct(calibration, matches, film or (), target, config)
     for line in drift_step.describe(corrected):
         watch.say(line)
-    return found, corrected.drift if corrected.is_drift else None
+    if not corrected.is_drift:
+        watch.say(f"warning     not corrected: {corrected.beyond(config.drift_px)}")
+        return found, None
+    return found, corrected.calibration
 
 
 def filmed(
@@ -196,7 +195,7 @@ def filmed(
 ) -> list[tuple[Sighting, Sighting]]:
     """Pairs of frames in which both cameras see the target whole, in poses that differ."""
     film = stereo_frames.read_film(config.capture, config.calibration, name)
-    wide = config.model_copy(update={"drift_px": SEARCH_PX})
+    wide = config.model_copy(update={"drift_px": drift_step.SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
     pairs = watch.follow(film.pairs(), len(film.times), "tracking")
     collected = target_poses.collect((found for _, found in poses_step.follow(tracker, film.times, pairs)), film.cameras)
@@ -209,18 +208,6 @@ def filmed(
     for line in track_figures.second_target(collected.apart_mm):
         watch.say(line)
     return [one.views for one in poses]
-
-
-def matched(config: Config, calibration: Calibration, watch: ConsoleWatch) -> Matches:
-    """Points of the surface that both cameras see."""
-    maps = []
-    for camera in CAMERAS:
-        shots = surface_part.read_surface(config.capture, camera, config.calibration)
-        maps.append(decode.decode(shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {camera}", camera=camera))
-    matches = fringe_matches.match((maps[0], maps[1]), calibration.cameras, np.random.default_rng(SEED), str(config.capture))
-    axes = " and ".join(("columns", "rows")[k] for k in matches.axes)
-    watch.say(f"fringes     {len(matches.pixels)} points in both cameras, {axes}")
-    return matches
 
 
 def tank(config: Config, held: Held, watch: ConsoleWatch) -> list[Verdict]:
