@@ -40,7 +40,7 @@ def set_greys(mesh: trimesh.Trimesh, greys: NDArray[np.uint8]) -> None:
     mesh.visual = ColorVisuals(mesh, vertex_colors=np.column_stack([greys, greys, greys, np.full_like(greys, 255)]))
 
 
-def joined(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def join(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """One mesh of several, with their normals, and the vertex attributes and grey levels that all of them have."""
     if len(parts) == 1:
         return parts[0]

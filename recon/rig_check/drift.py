@@ -94,7 +94,7 @@ def estimate(
     scale : relative standard deviation of the board's print, as in `recon.model.calibration.with_scale`
     drift_px : standard deviation of principal points by usual drift
     """
-    made, usual = calibrated(calibration, scale), usual_drift(calibration.cameras, drift_px)
+    made, usual = calibration_uncertainty(calibration, scale), usual_drift(calibration.cameras, drift_px)
     names = optics_equations.parameters(made, list(calibration.cameras))
     names = (*names, *(name for name in usual.names if name not in names))
     fixed, drifting = made.ordered(names), usual.ordered(names)
@@ -123,7 +123,7 @@ def estimate(
     return Drift(calibration, before, after, size, seen.surprise(prior(1.0)))
 
 
-def parted(found: Drift, points: Array, axes: Sequence[int]) -> Array:
+def parting(found: Drift, points: Array, axes: Sequence[int]) -> Array:
     """Displacement : (n, 3) mm, against points : (n, 3) mm by both cameras, of the same by light, as first calibrated."""
     cameras, before = found.after.cameras, found.before.cameras
     seen = {name: camera.project(points) for name, camera in cameras.items()}
@@ -131,7 +131,7 @@ def parted(found: Drift, points: Array, axes: Sequence[int]) -> Array:
     return by_light - meet([before[name] for name in CAMERAS], [seen[name] for name in CAMERAS])[0]
 
 
-def calibrated(calibration: Calibration, scale: float) -> Uncertainty:
+def calibration_uncertainty(calibration: Calibration, scale: float) -> Uncertainty:
     """Uncertainty of a calibration when it was made; nothing is uncertain of one without covariance but its scale."""
     known = with_scale(calibration.uncertainty, calibration.cameras, scale)
     return Uncertainty((), np.zeros((0, 0))) if known is None else known

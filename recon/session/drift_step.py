@@ -211,7 +211,7 @@ def measure(found: Drift, matches: Matches | None, views: int) -> Metrics:
         points = points_by_light(matches.pixels, matches.first, axes, found.after.cameras)
         before = Calibration(found.before.cameras, found.prior)
         figures |= {
-            "skin_moved_mm": float(np.sqrt(np.mean(np.sum(drift.parted(found, points, axes) ** 2, axis=1)))),
+            "skin_moved_mm": float(np.sqrt(np.mean(np.sum(drift.parting(found, points, axes) ** 2, axis=1)))),
             "skin_sigma_before_mm": parting_sigma(before, points, axes),
             "skin_sigma_mm": parting_sigma(found.after, points, axes),
         }

@@ -229,7 +229,7 @@ def with_more(skin: Skin, camera: Camera, views: Sequence[View], limits: Limits)
         more = second_view.alone(View(view.camera, view.found, more), skin.points, camera)
         if np.isfinite(more.points).any():
             meshes_of.append(surface_mesh.mesh(more, view.camera, limits.max_slope, view.found.offset))
-    mesh = meshes.joined(meshes_of)
+    mesh = meshes.join(meshes_of)
     more = {"points_added": len(mesh.vertices) - len(skin.mesh.vertices), "triangles": len(mesh.faces)}
     return replace(skin, mesh=mesh, figures=skin.figures | more)
 

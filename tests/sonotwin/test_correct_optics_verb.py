@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,8 +10,11 @@ import pytest
 
 from recon.capture import calibration_files
 from recon.files import metrics
+from recon.model.calibration import Calibration
 from recon.model.rig import Rig
+from recon.tracking.pose_fit import meet
 from sonotwin.cli import main
+from tests.recon.tracking import films
 from tests.twin.parting import parted_mm
 from tests.twin.small_rigs import half, half_as_fields
 from twin.optics.surface_session import calibration_of
@@ -106,3 +110,39 @@ def test_a_dark_second_camera_is_named_and_the_result_is_that_of_the_first(drift
         said = capsys.readouterr()
         assert ("cam2" in said.out + said.err) == (name == "dark")
     assert surfaces["dark"] == surfaces["alone"]
+
+
+def test_a_film_alone_shows_a_camera_that_drifted_across_the_other(rig, tmp_path, capsys):
+    """By 0.3 px along the columns, six times the usual: rays of the target's circles miss each other, and meet again.
+
+    The film is the capture's only sweep, without a name.
+    """
+    films.film(tmp_path / "film", rig, np.random.default_rng(4), count=6)
+    true = calibration_of(rig).cameras
+    matrix = true["cam2"].matrix + np.array([[0, 0, 0], [0, 0, 0.3], [0, 0, 0]])
+    wrong = {**true, "cam2": replace(true["cam2"], matrix=matrix)}
+    calibration_files.write(tmp_path / "optics.yaml", Calibration({name: wrong[name] for name in ("cam1", "cam2")}))
+    line = [f"capture={tmp_path / 'film'}", f"calibration={tmp_path / 'optics.yaml'}", f"out={tmp_path / 'out'}"]
+    assert main(["correct-optics", *line]) == 0
+    said = capsys.readouterr().out
+    assert "fringes     none before cam1 and cam2" in said and "3 views by both cameras, out of 6" in said  # 2 mm apart
+    points = np.random.default_rng(5).uniform([-40, -40, 640], [40, 40, 680], (20, 3))
+    seen = [true[name].project(points) for name in ("cam1", "cam2")]
+
+    def missed_px(file) -> float:
+        """Mean distance of cam2's rays from where both meet, along the columns."""
+        cameras = calibration_files.read(file).cameras
+        met = meet([cameras[name] for name in ("cam1", "cam2")], seen)[0]
+        return float(abs(np.mean((cameras["cam2"].project(met) - seen[1])[:, 1])))
+
+    assert missed_px(tmp_path / "optics.yaml") > 0.1 and missed_px(tmp_path / "out/optics.yaml") < 0.02
+
+
+def test_a_calibration_of_one_camera_and_the_projector_leaves_drift_out(drifted, tmp_path, capsys):
+    """As the rig authors' files are: the skin is camera 1's, and nothing has failed."""
+    known = calibration_files.read(drifted / "optics.yaml").cameras
+    calibration_files.write(tmp_path / "pair.yaml", Calibration({name: known[name] for name in ("cam1", "projector")}))
+    line = [f"capture={drifted / 'capture'}", f"calibration={tmp_path / 'pair.yaml'}", f"out={tmp_path / 'result'}"]
+    assert main(["reconstruct", *line]) == 0
+    said = capsys.readouterr().out
+    assert "left out    drift: no calibration of cam2" in said and "cam2 isn't compared: it has no calibration" in said

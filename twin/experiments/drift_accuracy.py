@@ -72,7 +72,7 @@ def sessions(setup: Setup, sessions: int = 200, times: float = 1.0, views: int =
 def session(setup: Setup, optics: Calibration, times: float, views: int, fringes: bool, k: int) -> Outcome:
     """Draw the calibration's error, drift, skin and target, and correct."""
     rng = np.random.default_rng([SEED, k])
-    calibrated, usual = drift.calibrated(optics, PRINT_SCALE), drift.usual_drift(optics.cameras, times * DRIFT_PX)
+    calibrated, usual = drift.calibration_uncertainty(optics, PRINT_SCALE), drift.usual_drift(optics.cameras, times * DRIFT_PX)
     once = drawn_check.drawn_rig(optics.cameras, calibrated, rng)
     true = drawn_check.drawn_rig(once, usual, rng)
     printed = conditions.printed(setup.rig.target, setup.conditions("lifelike").target, int(rng.integers(2**31)))

@@ -35,7 +35,7 @@ def apart(cameras, true, matches):
     """Mean displacement, mm, of the skin by light along camera 1's axis, against both cameras; and the places."""
     places = points_by_light(matches.pixels, matches.first, COLUMNS, true)
     found = drift.Drift(Calibration(cameras), NOTHING, Calibration(true), 1.0, 0.0)
-    return drift.parted(found, places, COLUMNS)[:, 2].mean(), places
+    return drift.parting(found, places, COLUMNS)[:, 2].mean(), places
 
 
 def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
@@ -113,7 +113,7 @@ def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
     normal = []
     for seed in range(10):
         rng = np.random.default_rng([11, seed])
-        wrong = drawn_check.drawn_rig(calibration.cameras, drift.calibrated(calibration, 3e-4), rng)
+        wrong = drawn_check.drawn_rig(calibration.cameras, drift.calibration_uncertainty(calibration, 3e-4), rng)
         true = drawn_check.drawn_rig(wrong, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
         printed = circle_layout.with_lengths(
             target, rng.multivariate_normal(circle_layout.lengths(target), circle_layout.length_covariance(target))
