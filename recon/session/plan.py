@@ -210,7 +210,11 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
     lit = held.surface is not None and set(CAMERAS) <= held.surface.images.keys()
     if optics is None or held.surface is None or settings.drift_px == 0:
         return optics
-    known = calibration_files.read(optics).cameras
+    try:
+        known = calibration_files.read(optics).cameras
+    except InputError as error:
+        steps.fail("drift", str(error))
+        return optics
     if missing := [name for name in (*CAMERAS, PROJECTOR) if name not in known]:
         steps.leave_out("drift", f"no calibration of {' and '.join(missing)}")
         return optics
