@@ -81,6 +81,7 @@ class Config(rendered_session.Settings):
             capture=self.out / CAPTURE,
             out=self.out / RESULT,
             camera=self.cameras[0],
+            board_scale=self.conditions.board.stretch,  # a laboratory knows how well its boards are printed
             temperature_c=WATER_C,
             tissue_m_s=self.tissue_m_s,
             overlays=True,
