@@ -100,16 +100,15 @@ def estimate(
     fixed, drifting = made.ordered(names), usual.ordered(names)
     lengths = root(circle_layout.length_covariance(target))
 
-    def prior(size: float) -> Array:
-        return block_diag(root(fixed + size**2 * drifting), lengths)
+    priors = {float(size): block_diag(root(fixed + size**2 * drifting), lengths) for size in SIZES}
 
     def solve(step: Array) -> tuple[Array, Array, float, Evidence]:
         """The next step from the calibration, its covariance, and the size of drift."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        size = float(SIZES[int(np.argmax([seen.logarithm(prior(size)) for size in SIZES]))])
-        mean, covariance = seen.posterior(prior(size))
+        size = max(priors, key=lambda size: seen.logarithm(priors[size]))
+        mean, covariance = seen.posterior(priors[size])
         return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
 
     step, left, size, seen = solve(np.zeros(len(names)))
@@ -120,15 +119,17 @@ def estimate(
         Uncertainty(tuple(names[k] for k in free), each[np.ix_(free, free)]) for each in (fixed + size**2 * drifting, left)
     )
     after = Calibration(moved(calibration.cameras, names, step), known)
-    return Drift(calibration, before, after, size, seen.surprise(prior(1.0)))
+    return Drift(calibration, before, after, size, seen.surprise(priors[1.0]))
 
 
-def parting(found: Drift, points: Array, axes: Sequence[int]) -> Array:
-    """Displacement : (n, 3) mm, against points : (n, 3) mm by both cameras, of the same by light, as first calibrated."""
-    cameras, before = found.after.cameras, found.before.cameras
-    seen = {name: camera.project(points) for name, camera in cameras.items()}
-    by_light = optics_equations.points_by_light(seen[CAMERAS[0]], seen[PROJECTOR][:, list(axes)], axes, before)
-    return by_light - meet([before[name] for name in CAMERAS], [seen[name] for name in CAMERAS])[0]
+def parting(known: Mapping[str, Camera], true: Mapping[str, Camera], points: Array, axes: Sequence[int]) -> Array:
+    """Displacement : (n, 3) mm of points : (n, 3) mm by light against the same by both cameras.
+
+    known, true : devices that they are measured by, and that see them
+    """
+    seen = {name: camera.project(points) for name, camera in true.items()}
+    by_light = optics_equations.points_by_light(seen[CAMERAS[0]], seen[PROJECTOR][:, list(axes)], axes, known)
+    return by_light - meet([known[name] for name in CAMERAS], [seen[name] for name in CAMERAS])[0]
 
 
 def calibration_uncertainty(calibration: Calibration, scale: float) -> Uncertainty:

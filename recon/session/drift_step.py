@@ -79,10 +79,9 @@ class Corrected:
     def beyond(self, drift_px: float) -> str:
         """A fault: more than drift."""
         size = f"{self.drift.size:.0f} times as much{' or more' if self.drift.size == SIZES[-1] else ''}"
-        cause = (
-            "was one pushed? `sonotwin check` names it; or is it another calibration? drift_px=... is of a rig that drifts more"
-        )
-        return f"expected devices that drifted by some {drift_px:g} px since their calibration, found {size}: {cause}"
+        expected = f"expected devices that drifted by some {drift_px:g} px since their calibration"
+        cause = "was one pushed? `sonotwin check` names it; or is it another calibration?"
+        return f"{expected}, found {size}: {cause} drift_px=... is of a rig that drifts more"
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
@@ -210,8 +209,9 @@ def measure(found: Drift, matches: Matches | None, views: int) -> Metrics:
         axes = matches.axes[:1]
         points = points_by_light(matches.pixels, matches.first, axes, found.after.cameras)
         before = Calibration(found.before.cameras, found.prior)
+        moved = drift.parting(before.cameras, found.after.cameras, points, axes)
         figures |= {
-            "skin_moved_mm": float(np.sqrt(np.mean(np.sum(drift.parting(found, points, axes) ** 2, axis=1)))),
+            "skin_moved_mm": float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
             "skin_sigma_before_mm": parting_sigma(before, points, axes),
             "skin_sigma_mm": parting_sigma(found.after, points, axes),
         }

@@ -39,7 +39,7 @@ from recon.tracking import networks
 NO_OPTICS = "no calibration of the cameras: no board, and none given"
 NO_PROBE = "no calibration of the probe: no sweep over crossed wires, and none given"
 NO_LAG = "latency failed; give lag_s"
-WITH_BOTH = "with those of both cameras it is corrected, which parts skin and target by a tenth of a millimetre"
+ONE_CAMERA = "fringes before one camera alone: what drifted parts skin and target by a tenth of a millimetre, unseen"
 WITHIN = 0.2  # of usual drift, that devices drift within a session: fringes and films were taken at other moments; assumed
 Command = Callable[[optics_step.Settings, Path], str]
 
@@ -219,7 +219,7 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
         steps.leave_out("drift", f"no calibration of {' and '.join(missing)}")
         return optics
     if not lit:
-        steps.leave_out("drift", f"fringes before one camera alone; {WITH_BOTH}")
+        steps.leave_out("drift", ONE_CAMERA)
         return optics
     same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks")
     fields = {field: getattr(settings, field) for field in same} | {"calibration": optics}

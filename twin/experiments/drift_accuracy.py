@@ -12,8 +12,7 @@ from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration
 from recon.optical_calibration import uncertainty
 from recon.rig_check import drift
 from recon.rig_check.drift import Drift
-from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
-from recon.tracking.pose_fit import meet
+from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from scenes.board_poses import Config as Poses
 from twin import conditions
 from twin.experiments import drawn_check, drawn_session
@@ -88,10 +87,9 @@ def _compared(found: Drift, true: Devices, matches: Matches) -> Outcome:
     apart, sigma, skin = [], [], []
     for calibration in (Calibration(found.before.cameras, found.prior), found.after):
         cameras = calibration.cameras
-        seen = {name: camera.project(places) for name, camera in true.items()}
-        by_light = points_by_light(seen["cam1"], seen[PROJECTOR][:, list(COLUMNS)], COLUMNS, cameras)
-        by_both = meet([cameras[name] for name in CAMERAS], [seen[name] for name in CAMERAS])[0]
-        apart.append(float(np.mean((by_light - by_both)[:, 2])))
+        shown = true[PROJECTOR].project(places)[:, list(COLUMNS)]
+        by_light = points_by_light(true["cam1"].project(places), shown, COLUMNS, cameras)
+        apart.append(float(np.mean(drift.parting(cameras, true, places, COLUMNS)[:, 2])))
         assert calibration.uncertainty is not None
         slope = uncertainty.parting(calibration, places, COLUMNS)[:, 2].mean(axis=0)
         sigma.append(float(np.sqrt(slope @ calibration.uncertainty.covariance @ slope)))

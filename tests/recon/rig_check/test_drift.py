@@ -6,7 +6,7 @@ import pytest
 from recon.geometry import rigid
 from recon.geometry.camera_jacobian import MOTION
 from recon.model import circle_layout
-from recon.model.calibration import DRIFT_PX, Calibration, Uncertainty
+from recon.model.calibration import DRIFT_PX, Calibration
 from recon.optical_calibration import uncertainty
 from recon.rig_check import drift
 from recon.rig_check.optics_equations import points_by_light
@@ -16,7 +16,6 @@ from twin.experiments import drawn_check
 from twin.optics.surface_session import calibration_of
 
 COLUMNS, SIGMA_PX = (0,), 0.02
-NOTHING = Uncertainty((), np.zeros((0, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +33,7 @@ def corrected(rig, calibration, true, rng, views=0):
 def apart(cameras, true, matches):
     """Mean displacement, mm, of the skin by light along camera 1's axis, against both cameras; and the places."""
     places = points_by_light(matches.pixels, matches.first, COLUMNS, true)
-    found = drift.Drift(Calibration(cameras), NOTHING, Calibration(true), 1.0, 0.0)
-    return drift.parting(found, places, COLUMNS)[:, 2].mean(), places
+    return drift.parting(cameras, true, places, COLUMNS)[:, 2].mean(), places
 
 
 def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
