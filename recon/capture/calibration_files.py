@@ -112,6 +112,7 @@ def write(path: Path, calibration: Calibration) -> None:
         storage.endWriteStruct()
     if calibration.uncertainty is not None:
         opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
+        storage.write(own.HAS_SCALE, int(calibration.uncertainty.has_scale))
     opencv_storage.save(path, storage)
 
 

@@ -30,6 +30,7 @@ class Uncertainty:
 
     names: tuple[str, ...]  # (g,)
     covariance: Array  # (g, g)
+    has_scale: bool = False  # whether the error of the scale is in it: that of the board's print, which no image shows
 
     def sigma(self, name: str) -> float:
         """Standard deviation of one parameter; zero if it was held fixed."""
@@ -62,7 +63,7 @@ class Calibration:
         object.__setattr__(self, "cameras", named)
 
 
-def in_use(known: Uncertainty | None, cameras: Mapping[str, Camera], scale: float, drift_px: float) -> Uncertainty | None:
+def in_use(known: Uncertainty | None, cameras: Mapping[str, Camera], scale: float | None, drift_px: float) -> Uncertainty | None:
     """Uncertainty of cameras that are used some time after they were calibrated: `with_scale` and `with_drift`."""
     return with_drift(with_scale(known, cameras, scale), cameras, drift_px)
 
@@ -85,14 +86,18 @@ def with_drift(known: Uncertainty | None, cameras: Mapping[str, Camera], drift_p
     return wider
 
 
-def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: float) -> Uncertainty | None:
+def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: float | None) -> Uncertainty | None:
     """Make the scale of all places at least as uncertain as the print of the board that gave it.
 
     A board's aspect and shear, which images show, say little of its scale, which they don't. All translations grow or shrink
     together by it, and with them all that the devices measure.
 
-    sigma : relative standard deviation of the print's scale.
+    sigma : relative standard deviation of its scale; None for what the calibration has, and that of paper where it has none
     """
+    if sigma is None:
+        if known is not None and known.has_scale:
+            return known
+        sigma = PRINT_SCALE
     moved = [f"{device}.{name}" for device in cameras if device != WORLD for name in ("tx", "ty", "tz")]
     shift = np.concatenate([camera.camera_from_world[:3, 3] for device, camera in cameras.items() if device != WORLD])
     wider = _extended(known, moved)
@@ -100,16 +105,18 @@ def with_scale(known: Uncertainty | None, cameras: Mapping[str, Camera], sigma: 
     translations = np.ix_(order, order)
     found = shift @ wider.covariance[translations] @ shift / (shift @ shift) ** 2
     if sigma**2 <= found:
-        return known
+        return None if known is None else replace(known, has_scale=True)
     wider.covariance[translations] += (sigma**2 - found) * np.outer(shift, shift)
-    return wider
+    return replace(wider, has_scale=True)
 
 
 def _extended(known: Uncertainty | None, names: Sequence[str]) -> Uncertainty:
     """A copy that has parameters of these names, too; without error where they were held fixed."""
     own = () if known is None else known.names
     every = (*own, *(name for name in names if name not in own))
-    return Uncertainty(every, np.zeros((len(every), len(every))) if known is None else known.ordered(every))
+    if known is None:
+        return Uncertainty(every, np.zeros((len(every), len(every))))
+    return replace(known, names=every, covariance=known.ordered(every))
 
 
 def moved(cameras: Mapping[str, Camera], names: Sequence[str], step: Array) -> dict[str, Camera]:

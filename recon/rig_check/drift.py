@@ -3,7 +3,7 @@
 Devices warm up, and creep on their mounts: their principal points move by some hundredths of a pixel, and what two cameras see
 parts from what one sees with the projector. Unknown are the errors of all calibrated parameters, those by drift included, with
 the covariance of both as their prior. They are measured by fringes on the skin that both cameras see, and by views of the target
-in both. What these leave open, such as the scale or a motion of all devices alike, keeps its prior.
+in both; a ball bar tells the scale. What these leave open, such as a motion of all devices alike, keeps its prior.
 
 The size of the usual drift is a guess. Where a session shows more, the prior of drift, not that of the calibration, grows to the
 size of greatest evidence (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was rather pushed.
@@ -24,7 +24,8 @@ from recon.geometry.camera_jacobian import MOTION
 from recon.model import circle_layout
 from recon.model.calibration import WORLD, Calibration, Uncertainty, moved, with_drift, with_scale
 from recon.model.rig import Target
-from recon.rig_check import fault_tests, optics_equations
+from recon.rig_check import ball_bar, fault_tests, optics_equations
+from recon.rig_check.ball_bar import Bars
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, DeviceRows, Matches
 from recon.tracking.pose_fit import Sighting, meet
 
@@ -82,8 +83,9 @@ def estimate(
     film: Sequence[tuple[Sighting, Sighting]] | None,
     matches: Matches | None,
     target: Target,
-    scale: float,
+    scale: float | None,
     drift_px: float,
+    bars: Bars | None = None,
 ) -> Drift:
     """Estimate the drift, and correct the calibration.
 
@@ -93,6 +95,7 @@ def estimate(
     matches : points of the skin that both cameras see under fringes; None without
     scale : relative standard deviation of the board's print, as in `recon.model.calibration.with_scale`
     drift_px : standard deviation of principal points by usual drift
+    bars : a ball bar under the fringes of camera 1
     """
     made, usual = calibration_uncertainty(calibration, scale), usual_drift(calibration.cameras, drift_px)
     names = optics_equations.parameters(made, list(calibration.cameras))
@@ -106,6 +109,9 @@ def estimate(
         """The next step from the calibration, its covariance, and the size of drift."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
+        if bars is not None:
+            certified = ball_bar.equations(bars, cameras, names, len(lengths))
+            rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
         size = max(priors, key=lambda size: seen.logarithm(priors[size]))
         mean, covariance = seen.posterior(priors[size])
@@ -116,7 +122,7 @@ def estimate(
         step, left, size, seen = solve(step)
     free = np.flatnonzero(np.diag(fixed + drifting) > 0)
     before, known = (
-        Uncertainty(tuple(names[k] for k in free), each[np.ix_(free, free)]) for each in (fixed + size**2 * drifting, left)
+        Uncertainty(tuple(names[k] for k in free), each[np.ix_(free, free)], True) for each in (fixed + size**2 * drifting, left)
     )
     after = Calibration(moved(calibration.cameras, names, step), known)
     return Drift(calibration, before, after, size, seen.surprise(priors[1.0]))
@@ -132,7 +138,7 @@ def parting(known: Mapping[str, Camera], true: Mapping[str, Camera], points: Arr
     return by_light - meet([known[name] for name in CAMERAS], [seen[name] for name in CAMERAS])[0]
 
 
-def calibration_uncertainty(calibration: Calibration, scale: float) -> Uncertainty:
+def calibration_uncertainty(calibration: Calibration, scale: float | None) -> Uncertainty:
     """Uncertainty of a calibration when it was made; nothing is uncertain of one without covariance but its scale."""
     known = with_scale(calibration.uncertainty, calibration.cameras, scale)
     return Uncertainty((), np.zeros((0, 0))) if known is None else known

@@ -19,18 +19,20 @@ from recon.geometry.camera_jacobian import difference
 from recon.model import circle_layout
 from recon.model.calibration import Calibration
 from recon.model.rig import Target
-from recon.optical_calibration import uncertainty
+from recon.optical_calibration import known_length, uncertainty
 from recon.reports import page
 from recon.reports.page import Opening, Section
-from recon.rig_check import drift, fringe_matches
+from recon.rig_check import ball_bar, drift, fringe_matches
+from recon.rig_check.ball_bar import Bars
 from recon.rig_check.drift import LARGEST, SIZES, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
+from recon.session.settings import BarFields
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import decode
 from recon.target_calibration import target_poses
-from recon.tracking.pose_fit import Sighting
+from recon.tracking.pose_fit import Sighting, meet
 
 BY = "correct-optics"  # who writes
 OPTICS, PAGE = "optics.yaml", "drift.html"
@@ -42,7 +44,7 @@ SHOWN = ("cx", "cy", "fx", "rx", "ry", "rz", "tx", "ty", "tz")  # parameters tha
 Array = NDArray[np.float64]
 
 
-class Settings(MeasuredTargetFields):
+class Settings(BarFields, MeasuredTargetFields):
     """Sources, and what is usual."""
 
     capture: Path
@@ -93,7 +95,8 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         If the capture is incomplete or damaged, shows nothing of the cameras' drift, or shows that something was moved; or `out`
         can't be written to.
     """
-    atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.target, settings.networks))
+    given = (settings.calibration, settings.target, settings.networks, *settings.bars)
+    atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     held = manifest.read_manifest(settings.capture)
     calibration = calibration_files.read_for(held.calibration_file(settings.capture, settings.calibration), sizes(held))
     if calibration.uncertainty is None:
@@ -103,8 +106,9 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     if matches is None and not film:
         expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
         raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
+    bars = find_bars(settings, calibration, watch)
     with watch.busy("estimating the drift"):
-        found = correct(calibration, matches, film, target_of(settings), settings)
+        found = correct(calibration, matches, film, target_of(settings), settings, bars)
     if not found.is_drift:
         raise InputError(f"{settings.capture}: {found.beyond(settings.drift_px)}")
     for line in describe(found):
@@ -122,14 +126,38 @@ def correct(
     film: Sequence[tuple[Sighting, Sighting]],
     target: Target,
     settings: MeasuredTargetFields,
+    bars: Bars | None = None,
 ) -> Corrected:
-    """Correct a calibration by points of the skin and views of the target, one of which may be missing.
+    """Correct a calibration by points of the skin and views of the target, one of which may be missing, and by a ball bar.
 
     A target of known lengths tells the scale, too; not one that cameras measured, whose lengths have theirs.
     """
     known = target if settings.target is None else with_open_scale(target)
-    found = drift.estimate(calibration, film or None, matches, known, settings.board_scale, settings.drift_px)
-    return Corrected(found, matches, len(film), measure(found, matches, len(film)))
+    found = drift.estimate(calibration, film or None, matches, known, settings.board_scale, settings.drift_px, bars)
+    return Corrected(found, matches, len(film), measure(found, matches, film))
+
+
+def find_bars(settings: Settings, calibration: Calibration, watch: Watch) -> Bars | None:
+    """The ball bar in each of the settings' captures; says its length by the calibration as it was. None without.
+
+    Raises
+    ------
+    InputError
+        If images are missing or damaged, can't be decoded, or show no two balls.
+    """
+    if settings.bar_mm is None:
+        return None
+    seen = []
+    for capture in settings.bars:
+        shots = surface_part.read_surface(capture, CAMERAS[0], settings.calibration)
+        found = decode.decode(
+            shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {CAMERAS[0]}", camera=CAMERAS[0]
+        )
+        seen.append(ball_bar.find(found, calibration.cameras, settings.ball_mm, str(capture)))
+        by_light = ball_bar.measure(seen[-1], calibration.cameras, ())
+        balls = " and ".join(f"{ball:.2f}" for ball in by_light.balls_mm)
+        watch.say(f"bar         {by_light.length_mm:.3f} mm of {settings.bar_mm[0]:g}, balls of {balls} mm")
+    return Bars(tuple(seen), *settings.bar_mm)
 
 
 def with_open_scale(target: Target) -> Target:
@@ -195,25 +223,32 @@ def look_at_target(settings: Settings, held: Manifest, watch: Watch) -> list[tup
     return kept
 
 
-def measure(found: Drift, matches: Matches | None, views: int) -> Metrics:
+def measure(found: Drift, matches: Matches | None, film: Sequence[tuple[Sighting, Sighting]]) -> Metrics:
     """Figures of a correction; of the skin, by its columns, or rows, alone, where fringes were matched."""
+    if matches is None:
+        both = [[view.camera for view in pair] for pair in film]
+        places = [meet(cameras, [view.centres for view in pair])[0] for cameras, pair in zip(both, film, strict=True)]
+        measured_by, volume = CAMERAS[1], np.concatenate(places)
+    else:
+        measured_by = PROJECTOR
+        volume = points_by_light(matches.pixels, matches.first, matches.axes[:1], found.after.cameras)
     figures: Metrics = {
         "matches": 0 if matches is None else len(matches.pixels),
-        "views": views,
+        "views": len(film),
         "size": found.size,
         "surprise_sigma": found.surprise,
+        "scale_sigma_ppm": 1e6 * uncertainty.scale(found.after, CAMERAS[0], measured_by, volume),
     }
     for name, (change, sigma) in changes(found).items():
         figures |= {f"{name.replace('.', '_')}_change": change, f"{name.replace('.', '_')}_sigma": sigma}
     if matches is not None:
         axes = matches.axes[:1]
-        points = points_by_light(matches.pixels, matches.first, axes, found.after.cameras)
         before = Calibration(found.before.cameras, found.prior)
-        moved = drift.parting(before.cameras, found.after.cameras, points, axes)
+        moved = drift.parting(before.cameras, found.after.cameras, volume, axes)
         figures |= {
             "skin_moved_mm": float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
-            "skin_sigma_before_mm": parting_sigma(before, points, axes),
-            "skin_sigma_mm": parting_sigma(found.after, points, axes),
+            "skin_sigma_before_mm": parting_sigma(before, volume, axes),
+            "skin_sigma_mm": parting_sigma(found.after, volume, axes),
         }
     return figures
 
@@ -251,6 +286,7 @@ def describe(found: Corrected) -> Iterator[str]:
     if "skin_moved_mm" in found.figures:
         moved, before, left = (found.figures[f"skin_{name}_mm"] for name in ("moved", "sigma_before", "sigma"))
         yield f"apart       skin from target by {moved:.3f} mm uncorrected (1 sigma {before:.3f}), and now 1 sigma {left:.3f} mm"
+    yield known_length.describe(1e-6 * float(found.figures["scale_sigma_ppm"] or 0))
 
 
 def write_page(found: Corrected, name: str) -> str:
@@ -270,6 +306,7 @@ def write_page(found: Corrected, name: str) -> str:
     if "skin_moved_mm" in found.figures:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]
         figures += [("skin from target, uncorrected", f"{moved:.3f}", "mm"), ("left, 1 σ", f"{left:.3f}", "mm")]
+    figures.append(("scale, 1 σ", f"{found.figures['scale_sigma_ppm']:.0f}", "ppm"))
     return page.render(Opening("Drift since the calibration", name, result, figures), sections, FOOTER)
 
 
@@ -279,6 +316,6 @@ LABELS |= {f"r{axis}": f"turn about {axis}" for axis in "xyz"} | {f"t{axis}": f"
 READING = (
     "Estimated together with all other errors of the calibration, whose covariance is known. Single parameters stay uncertain "
     "where others do the same to the images; what all do together to the skin, beside the target, is in the figures above.",
-    "A common motion of all devices shows nowhere, and a change of scale by a target of known lengths alone.",
+    "A common motion of all devices shows nowhere, and a change of scale by known lengths alone: a ball bar, a measured target.",
 )
 FOOTER = "This file is complete: it fetches nothing."

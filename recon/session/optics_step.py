@@ -13,15 +13,15 @@ from recon.capture.layouts import meza2021
 from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics, shown
-from recon.model.calibration import Calibration, with_scale
-from recon.optical_calibration import board_frames, calibration_report, figures_of_merit, joint_calibration
+from recon.model.calibration import Calibration
+from recon.optical_calibration import board_frames, calibration_report, figures_of_merit, joint_calibration, known_length
 from recon.optical_calibration.board_frames import DeviceName
 from recon.optical_calibration.distortion_selection import ModelName
 from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
-from recon.session.settings import BoardField
+from recon.session.settings import BoardField, BoardRowField
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import surface_figures
 
@@ -39,7 +39,7 @@ CONTENTS = {
 }
 
 
-class Settings(BoardField, joint_calibration.Settings):
+class Settings(BoardRowField, BoardField, joint_calibration.Settings):
     """Sources, and settings of the calibration."""
 
     capture: Path
@@ -77,7 +77,7 @@ def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> N
     captured = board_part.read_board(settings.capture)
     sizes = board_frames.sizes_of(captured, settings.devices)
     truth = None if settings.truth is None else calibration_files.read_for(settings.truth / manifest.OPTICS, sizes)
-    found = calibrate(captured, settings, settings.devices, truth, watch, settings.board_scale)
+    found = calibrate(captured, settings, settings.devices, truth, watch, settings.board_scale, settings.board_row_mm)
     names = write(out, found, command, truth)
     watch.say(f"wrote       {out}/{{{','.join(names)}}}")
 
@@ -88,7 +88,8 @@ def calibrate(
     devices: tuple[DeviceName, ...] | None = None,
     truth: Calibration | None = None,
     watch: Watch = SILENT,
-    board_scale: float = 0.0,
+    board_scale: float | None = 0.0,
+    board_row_mm: tuple[float, float] | None = None,
 ) -> Optics:
     """Calibrate cameras and projector, all at once, by a board in many poses.
 
@@ -96,7 +97,9 @@ def calibrate(
     ----------
     devices : that are calibrated; None for all of the capture
     truth : of a rendered capture, for the figures alone
-    board_scale : relative standard deviation of the print's scale, which no image shows; 0 leaves what its shape says of it
+    board_scale : relative standard deviation of the print's scale, which no image shows; 0 leaves what its shape says of it, None
+        is that of paper
+    board_row_mm : length of its longest row as measured, and its standard deviation, which give the scale
 
     Raises
     ------
@@ -130,10 +133,10 @@ def calibrate(
             result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
         )
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
-    made = result.adjustment.calibration
-    known = with_scale(made.uncertainty, made.cameras, board_scale) if len(made.cameras) > 1 else made.uncertainty
-    result = replace(result, adjustment=replace(result.adjustment, calibration=replace(made, uncertainty=known)))
+    result, larger = known_length.with_length(result, board_scale, board_row_mm, captured.name)
     figures = figures_of_merit.measure(result, truth)
+    if board_row_mm is not None:
+        figures["scale_change_ppm"] = 1e6 * larger
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
     for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
         watch.say(line)
@@ -178,6 +181,10 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
         scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
         yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
+        if "scale_change_ppm" in figures:
+            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by the board's longest row, in place of its description"
+        row_mm = known_length.row_length(result.adjustment.points, result.observations.points)
+        yield known_length.describe(1e-6 * float(figures["scale_sigma_ppm"] or 0), row_mm)
     else:
         seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
         yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"

@@ -30,7 +30,7 @@ from recon.session import (
     store,
     volume_step,
 )
-from recon.session.settings import EchoFields, ScaleFields, Spacing, TargetField
+from recon.session.settings import BarFields, BoardRowField, EchoFields, ScaleFields, Spacing, TargetField
 from recon.session.store import Store, files_of
 from recon.session.tracker_settings import TrackingFields
 from recon.session.watch import SILENT, Watch
@@ -44,7 +44,7 @@ WITHIN = 0.2  # of usual drift, that devices drift within a session: fringes and
 Command = Callable[[optics_step.Settings, Path], str]
 
 
-class Settings(EchoFields, TissueFields, TargetField, TrackingFields, ScaleFields):
+class Settings(EchoFields, TissueFields, TargetField, BoardRowField, BarFields, TrackingFields, ScaleFields):
     """Source, and what is known beforehand."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -127,7 +127,7 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
     """
     sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command)
     steps = Store(out, watch.announce, code)
-    given = (settings.calibration, settings.target, settings.probe, settings.networks)
+    given = (settings.calibration, settings.target, settings.probe, settings.networks, *settings.bars)
     check(sources)
     with steps.opened([settings.capture, *given]):
         calibrated = calibrate_optics(steps, sources)
@@ -167,6 +167,8 @@ def check(sources: Sources) -> None:
         target_files.read(settings.target, settings.rig.target)
     if settings.probe is not None:
         probe_files.read(settings.probe)
+    for bar in settings.bars:
+        manifest.read_manifest(bar)
     if settings.networks is not None and not settings.networks.exists():
         raise InputError(f"networks: expected a folder or a file, found nothing at {settings.networks}")
     path = settings.capture / MANIFEST
@@ -195,7 +197,8 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
     def work(by_board: optics_step.Settings, out: Path) -> None:
         optics_step.run(by_board, out, sources.command(by_board, out), sources.watch)
 
-    does, fields = "cameras and projector, from the board", {"capture": settings.capture, "board_scale": settings.board_scale}
+    does, same = "cameras and projector, from the board", ("capture", "board_scale", "board_row_mm")
+    fields = {field: getattr(settings, field) for field in same}
     made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, sources.files("board"))
     return None if made is None else made / optics_step.OPTICS
 
@@ -209,6 +212,10 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
     filmed = [sweep_part(name) for name, part in sources.sweeps.items() if set(CAMERAS) <= part.images.keys()]
     lit = held.surface is not None and set(CAMERAS) <= held.surface.images.keys()
     if optics is None or held.surface is None or settings.drift_px == 0:
+        if settings.bars:
+            steps.leave_out(
+                "drift", "the ball bar isn't used: that needs a calibration, fringes on the skin, and drift_px above 0"
+            )
         return optics
     try:
         known = calibration_files.read(optics).cameras
@@ -221,10 +228,10 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
     if not lit:
         steps.leave_out("drift", ONE_CAMERA)
         return optics
-    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks")
+    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "bars", "bar_mm", "ball_mm")
     fields = {field: getattr(settings, field) for field in same} | {"calibration": optics}
-    weights = settings.networks or networks.WEIGHTS
-    made_of = sources.files("surface", *filmed) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
+    given = [settings.networks or networks.WEIGHTS, *filter(None, [settings.target]), *settings.bars]
+    made_of = sources.files("surface", *filmed) | _known_by(steps, "optics", optics, *given)
     does, work = "the calibration, corrected for drift", partial(drift_step.run, watch=sources.watch)
     made = steps.do("drift", does, drift_step.BY, drift_step.Settings, fields, work, made_of)
     return optics if made is None else made / drift_step.OPTICS
@@ -265,7 +272,7 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, 
     same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
     fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
     if corrected and calibration_files.read(optics).uncertainty is not None:
-        fields |= {"drift_px": WITHIN * settings.drift_px, "board_scale": 0.0}
+        fields |= {"drift_px": WITHIN * settings.drift_px, "board_scale": None}
     weights = settings.networks or networks.WEIGHTS
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)

@@ -7,8 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
-from recon.model.calibration import PRINT_SCALE
-from recon.model.rig import NotNegative, Part, Probe
+from recon.model.rig import NotNegative, Part, Positive, Probe
 from recon.segmentation.blur_correction import MOST_MM, Blur
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
 
@@ -20,9 +19,36 @@ OF_THE_SCALE = "rig.probe.scale_mm_per_px"
 class BoardField(Part):
     """The field of a step whose lengths are those of a calibration board."""
 
-    board_scale: Annotated[float, Field(ge=0, le=0.1)] = PRINT_SCALE
-    """relative standard deviation of the scale of the board that the cameras were calibrated with, where the calibration has
-    less: of paper by moisture; 1e-5 of chrome on glass; of a print, 0.03 mm by a calliper over 150 mm are 2e-4"""
+    board_scale: Annotated[float, Field(ge=0, le=0.1)] | None = None
+    """relative standard deviation of the scale of the board that the cameras were calibrated with, at least: 3e-4 of paper, by
+    moisture; 1e-5 of chrome on glass. null: what the calibration says, and that of paper where it says nothing"""
+
+
+class BoardRowField(Part):
+    """The field of a step that calibrates by a board of which one length was measured."""
+
+    board_row_mm: tuple[Positive, Positive] | None = None
+    """mm, distance of the first from the last point of the board's longest row, as measured, and its standard deviation: of
+    discs by a caliper, the mean of outer and inner edges, [240.1,0.03]. It gives the scale, which else is the description's"""
+
+
+class BarFields(Part):
+    """Fields of a step that corrects the scale by a ball bar."""
+
+    bars: tuple[Path, ...] = ()
+    """capture folders with fringes and a code before a ball bar, two balls of matt paint, which gives the scale: one, or better
+    some, with the bar in other places; taken on the same day"""
+    bar_mm: tuple[Positive, Positive] | None = None
+    """mm, certified distance of the balls' centres, and its standard deviation: [150.012,0.002]"""
+    ball_mm: Positive = 25.4
+    """mm, diameter of the balls, within 5 %"""
+
+    @model_validator(mode="after")
+    def _certified(self) -> "BarFields":
+        if bool(self.bars) != (self.bar_mm is not None):
+            lacking, given = ("bar_mm", "bars") if self.bars else ("bars", "bar_mm")
+            raise ValueError(f"{lacking}: expected beside {given}, found nothing")
+        return self
 
 
 class TargetField(Part):

@@ -19,7 +19,7 @@ from recon.geometry.camera import Camera
 from recon.geometry.circle_outline import ellipses_of
 from recon.geometry.ellipses import Ellipses, joined
 from recon.model import circle_layout
-from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Uncertainty, in_use
+from recon.model.calibration import DRIFT_PX, Uncertainty, in_use
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
 from recon.tracking.circle_detector import Window
@@ -93,7 +93,7 @@ class Tracker:
     bits: int | None = None  # of frames deeper than 8 bits, see `frames.grey`
     optics: Uncertainty | None = None  # of the cameras' calibration, as its file has it; None where it isn't known, or exact
     drift_px: float = DRIFT_PX  # standard deviation of principal points since the calibration; 0 of exact cameras
-    board_scale: float = PRINT_SCALE  # relative, of the board that the cameras were calibrated with; 0 of an exact one
+    board_scale: float | None = None  # relative, of the board of their calibration; None: as `optics` has it, or of paper
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
     _disc_px: float | None = field(default=None, init=False)  # diameter when it was seen last
     _last: Array | None = field(default=None, init=False)  # the last pose, however old

@@ -10,7 +10,7 @@ import pytest
 
 from recon.capture import calibration_files
 from recon.files import metrics
-from recon.model.calibration import Calibration
+from recon.model.calibration import Calibration, Uncertainty
 from recon.model.rig import Rig
 from recon.tracking.pose_fit import meet
 from sonotwin.cli import main
@@ -146,3 +146,50 @@ def test_a_calibration_of_one_camera_and_the_projector_leaves_drift_out(drifted,
     assert main(["reconstruct", *line]) == 0
     said = capsys.readouterr().out
     assert "left out    drift: no calibration of cam2" in said and "cam2 isn't compared: it has no calibration" in said
+
+
+@pytest.fixture(scope="module")
+def bar(rig, drifted):
+    """A capture of a ball bar by the same cameras, and a calibration by a board that was printed smaller by a thousandth."""
+    scene = ["scene=ball_bar", *SCENE[1:]]
+    assert main(["render", *scene, *half_as_fields(moved(rig, 2 * DRIFT_PX)), f"out={drifted / 'bar'}"]) == 0
+    made = calibration_files.read(drifted / "optics.yaml")
+    larger = {}
+    for name, camera in made.cameras.items():
+        place = camera.camera_from_world.copy()
+        place[:3, 3] *= 1.001
+        larger[name] = replace(camera, camera_from_world=place)
+    names = tuple(f"{device}.{axis}" for device in ("cam2", "projector") for axis in ("cx", "cy"))
+    known = Uncertainty(names, 0.05**2 * np.eye(len(names)))
+    calibration_files.write(drifted / "larger.yaml", Calibration(larger, known))
+    return drifted / "bar/capture"
+
+
+def test_a_ball_bar_tells_the_scale(drifted, bar, tmp_path, capsys):
+    """A board's print off by 1e-3 comes down to 2e-4; later steps keep what is known of it."""
+    out, fields = tmp_path / "out", [f"bars=[{bar}]", "bar_mm=[150.0,0.005]", "board_scale=1e-3"]
+    assert correct(drifted, out, drifted / "larger.yaml", *fields) == 0
+    said, sigma = capsys.readouterr().out, 1e-6 * metrics.read(out / "metrics.json")["scale_sigma_ppm"]
+    assert "bar         150.1" in said and "scale       known to " in said
+    found = calibration_files.read(out / "optics.yaml")
+    true = calibration_files.read(drifted / "truth/calibration/optics.yaml").cameras
+    baselines = [np.linalg.norm(cameras["projector"].centre) for cameras in (found.cameras, true)]
+    assert abs(baselines[0] / baselines[1] - 1) < 2e-4 and sigma < 1.5e-4
+    assert found.uncertainty.has_scale
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        (["bars=[BAR]"], "bar_mm: expected beside bars, found nothing"),
+        (["bar_mm=[150.0,0.005]"], "bars: expected beside bar_mm, found nothing"),
+        (["bars=[BAR]", "bar_mm=[150.0,0.005]", "ball_mm=40"], "expected two balls of 40 mm before cam1 and projector, found "),
+        (["bars=[SKIN]", "bar_mm=[150.0,0.005]"], "expected two balls of 25.4 mm before cam1 and projector, found "),
+        (["bars=[nowhere]", "bar_mm=[150.0,0.005]"], "nowhere/manifest.json: expected a file, found none"),
+    ],
+)
+def test_a_bar_that_is_none_is_refused(drifted, bar, tmp_path, capsys, fields, complaint):
+    given = [field.replace("BAR", str(bar)).replace("SKIN", str(drifted / "capture")) for field in fields]
+    assert correct(drifted, tmp_path / "out", drifted / "larger.yaml", *given) == 2
+    error = capsys.readouterr().err
+    assert complaint in error and error.count("\n") == 1 and not (tmp_path / "out").exists()

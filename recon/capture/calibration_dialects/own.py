@@ -1,7 +1,7 @@
 """sonotwin's own `optics.yaml`: OpenCV FileStorage YAML.
 
-For every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known, `parameters`, their names, and
-`covariance`.
+For every device a map of `size`, `matrix`, `distortion` and `camera_from_world`; and, if known, `parameters`, their names,
+`covariance`, and `has_scale`, whether the error of the board's scale is in it: 0 or 1.
 """
 
 from collections.abc import Mapping
@@ -18,6 +18,7 @@ from recon.model.calibration import WORLD, Calibration, Uncertainty
 from recon.model.lengths import UNIT_KEY
 
 TOLD_BY = "schema"
+HAS_SCALE = "has_scale"
 SCHEMA = "sonotwin-optics/1"
 
 
@@ -36,7 +37,7 @@ def _calibration(path: Path, values: Values) -> Calibration:
         found = short(values["schema"]) if isinstance(values["schema"], str) else "a value that is no text"
         raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
     cameras = {}
-    own_keys = ("schema", "parameters", "covariance", UNIT_KEY)  # any other is a device
+    own_keys = ("schema", "parameters", "covariance", HAS_SCALE, UNIT_KEY)  # any other is a device
     for name in [name for name in values if name not in own_keys]:
         device = values[name]
         if not isinstance(device, dict):
@@ -63,4 +64,7 @@ def _uncertainty(path: Path, values: Values, cameras: Mapping[str, Camera]) -> U
     wrong = next((name for k, name in enumerate(names) if name not in known or name in names[:k]), None)
     if wrong is not None:
         raise InputError(f"{path}: parameters: expected a device's parameter like projector.fx, each once, found {short(wrong)}")
-    return Uncertainty(names, opencv_storage.covariance(path, values, len(names)))
+    has_scale = values.get(HAS_SCALE, 0)
+    if not isinstance(has_scale, int) or has_scale not in (0, 1):
+        raise InputError(f"{path}: {HAS_SCALE}: expected 0 or 1, found {short(str(has_scale))}")
+    return Uncertainty(names, opencv_storage.covariance(path, values, len(names)), bool(has_scale))

@@ -1,5 +1,6 @@
 """Calibration files of every dialect come back as they were, and bad ones are refused in one line."""
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -532,6 +533,20 @@ def test_a_file_of_ours_without_devices_is_refused(tmp_path, content, complaint)
     with pytest.raises(InputError) as refusal:
         calibration_files.read(path)
     assert str(refusal.value) == f"{path}: {complaint}"
+
+
+@pytest.mark.parametrize("has_scale", [False, True])
+def test_a_file_says_whether_the_scales_error_is_in_its_covariance(optics, tmp_path, has_scale):
+    """And one of before, without the key, that it isn't; another value is refused."""
+    path, known = tmp_path / "optics.yaml", Uncertainty(("cam2.tx",), np.eye(1), has_scale)
+    calibration_files.write(path, Calibration(optics.cameras, known))
+    assert calibration_files.read(path).uncertainty.has_scale is has_scale
+    text = path.read_text()
+    path.write_text(re.sub(r"has_scale: \d\n", "", text))
+    assert calibration_files.read(path).uncertainty.has_scale is False
+    path.write_text(re.sub(r"has_scale: \d", "has_scale: 3", text))
+    with pytest.raises(InputError, match=r"optics\.yaml: has_scale: expected 0 or 1, found 3$"):
+        calibration_files.read(path)
 
 
 def test_a_missing_file_or_size_is_named(optics, tmp_path):

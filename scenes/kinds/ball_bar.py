@@ -1,0 +1,56 @@
+"""A ball bar: two balls on a rod, whose centres stand apart by a certified length, before a background plane."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from recon.geometry import rigid
+from recon.geometry.primitives import Plane, Sphere
+from recon.model.rig import Fraction, Part, Positive, Vector
+from scenes import solid_meshes
+from scenes.scene_types import Material, Scene, Thing
+
+
+class Config(Part):
+    """The bar by its place, lengths and paint."""
+
+    length_mm: Annotated[float, Field(gt=0, le=400)] = 150.0  # from centre to centre
+    ball_mm: Annotated[float, Field(gt=0, le=100)] = 25.4  # diameter of the balls
+    rod_mm: Positive = 8.0  # diameter
+    middle_mm: Vector = (4.0, -2.0, 650.0)
+    turn_deg: float = 20.0  # of the bar about camera 1's axis, from its x axis
+    background_mm: Positive | None = 710.0  # z of the plane behind it; None for nothing behind
+    reflectance: Fraction = 0.6
+    background_reflectance: Fraction = 0.3
+
+    @model_validator(mode="after")
+    def _apart(self) -> "Config":
+        if self.length_mm <= self.ball_mm:
+            raise ValueError(f"length_mm: expected more than ball_mm, {self.ball_mm:g}, found {self.length_mm:g}")
+        back = self.middle_mm[2] + self.ball_mm / 2
+        if self.background_mm is not None and self.background_mm < back:
+            raise ValueError(f"background_mm: expected at least {back:g}, behind the balls, found {self.background_mm:g}")
+        return self
+
+
+def build(config: Config) -> Scene:
+    """The balls, with their exact shapes for a renderer that has spheres, the rod between them, and the background."""
+    middle, turn = np.array(config.middle_mm), np.deg2rad(config.turn_deg)
+    along = np.array([np.cos(turn), np.sin(turn), 0.0])
+    paint, things, shapes = Material(config.reflectance), [], []
+    for name, side in (("first", -0.5), ("second", 0.5)):
+        centre = middle + side * config.length_mm * along
+        ball = Sphere(name, centre, config.ball_mm / 2)
+        mesh = solid_meshes.moved(solid_meshes.ball(config.ball_mm / 2), rigid.transform(np.eye(3), centre))
+        things.append(Thing(name, mesh, paint, primitive=ball))
+        shapes.append(ball)
+    upright = np.array([0.0, 0.0, 1.0])
+    lying = rigid.transform(np.column_stack([along, np.cross(upright, along), upright]), middle)
+    things.append(Thing("rod", solid_meshes.moved(solid_meshes.rod(config.rod_mm / 2, config.length_mm), lying), paint))
+    if config.background_mm is not None:
+        place = rigid.transform(np.eye(3), (middle[0], middle[1], config.background_mm))
+        background = solid_meshes.moved(solid_meshes.plate((320, 260), 5), place)
+        things.append(Thing("background", background, Material(config.background_reflectance), smooth=False))
+        shapes.append(Plane("background", place[:3, 3], np.array([0.0, 0.0, -1.0])))
+    return Scene("ball_bar", tuple(things), tuple(shapes))

@@ -1,0 +1,87 @@
+"""A length measured on the board gives the scale: weighed with what is usual of prints, and as well known as it says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.model.calibration import with_scale
+from recon.optical_calibration import joint_calibration, known_length, uncertainty
+from recon.optical_calibration.joint_calibration import Settings
+from tests.recon.board_sets import BOARD, devices, random_poses, sightings
+
+PRINT, CALIPER_MM = 3e-4, 0.03
+
+
+@pytest.fixture(scope="module")
+def cameras(rig):
+    return devices(rig)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["released", "as designed"])
+def result(cameras, request):
+    """A calibration by 12 poses, of a board whose shape was found with them, or taken as designed."""
+    rng = np.random.default_rng(12)
+    seen = sightings(cameras, random_poses(cameras, 12, rng), rng)
+    settings = Settings(distortion="decentred", shape={"released": request.param})
+    return joint_calibration.calibrate(seen, BOARD, {name: camera.size for name, camera in cameras.items()}, settings)
+
+
+def baseline(result):
+    """Distance of the cameras, mm, and the standard deviation of the scale of what they measure, by the result."""
+    found = result.adjustment.calibration
+    volume = uncertainty.working_volume(found, [620.0, 680.0])
+    return np.linalg.norm(found.cameras["cam2"].centre), uncertainty.scale(found, "cam1", "cam2", volume)
+
+
+def test_the_scale_is_as_well_known_as_it_says(result):
+    """Of 100 boards printed larger by 3e-4 RMS, measured to 0.03 mm: the error over the predicted sigma, to 4 standard deviations
+    of chi-square; images of a larger board, farther away, are the same."""
+    rng = np.random.default_rng(5)
+    was, _ = baseline(result)
+    length = known_length.row_length(result.adjustment.points, BOARD.points())
+    left = []
+    for larger, noise in rng.standard_normal((100, 2)) * [PRINT, CALIPER_MM]:
+        found, step = known_length.with_length(result, PRINT, (length * (1 + larger) + noise, CALIPER_MM), "board")
+        now, sigma = baseline(found)
+        assert now / was == pytest.approx(1 + step, abs=1e-12)
+        assert found.adjustment.points == pytest.approx((1 + step) * result.adjustment.points)
+        left.append((step - larger) / sigma)
+    expected = PRINT * CALIPER_MM / length / np.hypot(PRINT, CALIPER_MM / length)
+    assert sigma == pytest.approx(expected, rel=0.25), "a little more, by the noise of the images"
+    assert abs(np.mean(np.square(left)) - 1) < 4 * np.sqrt(2 / 100)
+
+
+def test_without_a_length_the_print_counts(result):
+    """As it did: at least what is usual of prints."""
+    found, step = known_length.with_length(result, None, None, "board")
+    known = found.adjustment.calibration.uncertainty
+    made = result.adjustment.calibration
+    assert step == 0 and known.has_scale
+    assert np.allclose(known.covariance, with_scale(made.uncertainty, made.cameras, PRINT).covariance)
+    assert baseline(found)[1] == pytest.approx(PRINT, rel=0.1)
+
+
+def test_a_well_known_scale_isnt_widened_again(result):
+    """By a step that isn't told how well the board is printed; one that is told, widens it."""
+    length = known_length.row_length(result.adjustment.points, BOARD.points())
+    made = known_length.with_length(result, PRINT, (length, 0.005), "board")[0].adjustment.calibration
+    assert with_scale(made.uncertainty, made.cameras, None) is made.uncertainty
+    wider = replace(made, uncertainty=with_scale(made.uncertainty, made.cameras, PRINT))
+    volume = uncertainty.working_volume(made, [620.0, 680.0])
+    assert uncertainty.scale(made, "cam1", "cam2", volume) < 7e-5
+    assert uncertainty.scale(wider, "cam1", "cam2", volume) == pytest.approx(PRINT, rel=0.1)
+
+
+def test_a_length_of_another_board_is_refused(result):
+    length = known_length.row_length(result.adjustment.points, BOARD.points())
+    with pytest.raises(InputError, match=r"board_row_mm: expected .* found .*another board, or a row from edge to edge"):
+        known_length.with_length(result, PRINT, (length + 6.0, CALIPER_MM), "board")
+    known_length.with_length(result, 0.02, (length + 6.0, CALIPER_MM), "board")
+
+
+def test_the_way_to_a_better_scale_is_the_cheapest_that_halves_it():
+    assert "caliper" in known_length.describe(3e-4, 240.0) and "125" in known_length.describe(3e-4, 240.0)
+    assert "microscope" in known_length.describe(3e-4) and "glass" in known_length.describe(4e-5)
+    assert known_length.describe(1e-5) == "scale       known to 10 ppm"
