@@ -168,6 +168,7 @@ def together(found: Sequence[Metrics]) -> Figures:
         "contact_mm": abs(contact.mean()),
         "worst_contact_mm": np.abs(contact).max(),
     }
+    figures["wall_over_sigma"] = rms(each(found, "cover_wall_error_mm") / each(found, "cover_wall_sigma_mm")) ** 2
     for name, measure in (("cr1", repeatability.between_pairs), ("cr2", repeatability.from_mean)):
         mm = measure(apart) if several else np.full(5, np.nan)
         figures |= {f"{name}_centre_mm": mm[0], f"{name}_corner_mm": mm[1:].max(), f"{name}_mean_mm": mm.mean()}

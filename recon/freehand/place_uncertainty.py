@@ -23,6 +23,7 @@ from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 Array = NDArray[np.float64]
 
 COLUMNS = (3, 0, 1)  # of a matrix from pixels: the origin, u, v
+GIVEN_MM = 0.05  # standard deviation by which a bracket gives between wires and sweep; assumed: a printed one, pressed
 
 
 @dataclass(frozen=True)
@@ -106,6 +107,43 @@ def sigmas(form: Array, pixels: Array) -> Array:
     """Standard deviations : (..., n) mm over all directions, of pixels : (n, 2) u, v, by forms : (..., 3, 3)."""
     terms = np.column_stack([np.ones(len(pixels)), pixels])
     return np.sqrt(np.einsum("ni,...ij,nj->...n", terms, form, terms))
+
+
+def mean_sigma(
+    world_from_pixel: Array,
+    probe: ProbeCalibration,
+    errors: PlaceErrors | None,
+    used: NDArray[np.intp],
+    pixels: Array,
+    directions: Array,
+) -> float:
+    """Standard deviation, mm, of the mean displacement of a pixel in each of some B-scans, against what light measures.
+
+    What errs alike in both isn't in it: the frame of the optics, and the target's print, which the probe's calibration has in it.
+
+    Parameters
+    ----------
+    world_from_pixel, errors : of all n B-scans
+    used : (m,) numbers of those that count
+    pixels, directions : (m, 2) u, v in each of these, and unit vectors : (m, 3) along which displacements count
+    """
+    terms = np.column_stack([np.ones(len(pixels)), pixels])
+
+    def along(slopes: Array) -> Array:
+        """Derivatives : (m, k) of the displacements, from slopes : (m, 3, 3, k) of places."""
+        return np.einsum("nt,ntik,ni->nk", terms, slopes, directions)
+
+    world, variance = world_from_pixel[used], GIVEN_MM**2
+    if probe.uncertainty is not None:
+        by_probe = along(probe_slopes(world, probe)).mean(axis=0)
+        variance += float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
+    if errors is not None:
+        by_lag = along(rate_slopes(errors.rates[used])).mean(axis=0)
+        by_depth = along(depth_slopes(world, probe.face_row)).mean(axis=0)
+        by_each = errors.shares[used].T @ along(pose_slopes(world, probe)) / len(used)
+        variance += float(errors.lag_s**2 * by_lag @ by_lag + errors.depth**2 * by_depth @ by_depth)
+        variance += float(np.einsum("mk,mkl,ml->", by_each, errors.poses, by_each))
+    return float(np.sqrt(variance))
 
 
 def sigma_volume(

@@ -11,18 +11,15 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
-from recon.estimation.covariance import propagate
 from recon.files.metrics import Metrics
 from recon.freehand import place_uncertainty
 from recon.freehand.scans import Scans
-from recon.model.probe import NAMES
 from recon.segmentation.containment import below
 
 Array = NDArray[np.float64]
 
 PLACES, NEIGHBOURS = 45, 15  # along the face, a mm or so apart; and those that noise is smoothed over
 GEL_MM = 1.0  # of gel, that the face stands off at most without a word; assumed
-GIVEN_MM = 0.05  # standard deviation by which a bracket gives between wires and sweep; assumed: a printed one, pressed
 FEWEST = 5  # B-scans over the skin
 ALARM_SIGMA = 3.0
 CAUSES = "skin that is pressed, that moved since the fringes, devices that drifted, or a wrong lag"
@@ -78,11 +75,7 @@ class Contact:
 
 
 def measure(scans: Scans, skin: trimesh.Trimesh) -> Contact:
-    """Distances of the face in each B-scan from a skin, with what is known of their errors.
-
-    What errs alike in skin and probe isn't in sigma: the frame of the optics, and the target's print, which the probe's
-    calibration has in it.
-    """
+    """Distances of the face in each B-scan from a skin, with what is known of their errors."""
     row = 0.0 if scans.probe is None else scans.probe.face_row
     columns = np.linspace(0, scans.shape[1] - 1, PLACES)
     face = np.column_stack([columns, np.full(PLACES, row), np.zeros(PLACES), np.ones(PLACES)])
@@ -95,7 +88,10 @@ def measure(scans: Scans, skin: trimesh.Trimesh) -> Contact:
     distances = np.full(len(scans.world_from_pixel), np.nan)
     distances[placed[over]] = np.nanmin(heights[over], axis=1)
     normals = towards.reshape(-1, PLACES, 3)[np.flatnonzero(over), nearest]
-    return Contact(distances, _sigma(scans, placed[over], face[nearest, :2], normals))
+    sigma, used = np.nan, placed[over]
+    if scans.probe is not None and scans.probe.uncertainty is not None and len(used):
+        sigma = place_uncertainty.mean_sigma(scans.world_from_pixel, scans.probe, scans.errors, used, face[nearest, :2], normals)
+    return Contact(distances, sigma)
 
 
 def _smoothed(heights: Array) -> Array:
@@ -108,24 +104,3 @@ def _smoothed(heights: Array) -> Array:
     if known.any():
         smooth[known] = savgol_filter(heights[known], NEIGHBOURS, 2, axis=1)
     return smooth
-
-
-def _sigma(scans: Scans, used: NDArray[np.intp], pixels: Array, normals: Array) -> float:
-    """Standard deviation of the mean distance, mm, of some B-scans, at pixels : (n, 2), along normals : (n, 3)."""
-    probe, errors = scans.probe, scans.errors
-    if probe is None or probe.uncertainty is None or not len(used):
-        return np.nan
-    terms = np.column_stack([np.ones(len(pixels)), pixels])
-
-    def along(slopes: Array) -> Array:
-        """Derivatives : (n, k) of the distances, from slopes : (n, 3, 3, k) of places as of `place_uncertainty`."""
-        return np.einsum("nt,ntik,ni->nk", terms, slopes, normals)
-
-    world = scans.world_from_pixel[used]
-    by_probe = along(place_uncertainty.probe_slopes(world, probe)).mean(axis=0)
-    variance = GIVEN_MM**2 + float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
-    if errors is not None:
-        by_lag = along(place_uncertainty.rate_slopes(errors.rates[used])).mean(axis=0)
-        by_each = errors.shares[used].T @ along(place_uncertainty.pose_slopes(world, probe)) / len(used)
-        variance += float(errors.lag_s**2 * by_lag @ by_lag + np.einsum("mk,mkl,ml->", by_each, errors.poses, by_each))
-    return float(np.sqrt(variance))

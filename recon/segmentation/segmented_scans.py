@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.files.metrics import Metrics, shown
+from recon.freehand import place_uncertainty
 from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.geometry.primitives import Cylinder
@@ -26,7 +27,7 @@ from recon.segmentation.tube_wall import Appearance, Ring, Tube
 Array = NDArray[np.float64]
 
 OVERLAYS = 4
-COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm")  # figures
+COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm", "cover_wall_sigma_mm")  # figures
 
 
 @dataclass(frozen=True)
@@ -141,18 +142,33 @@ def find_tube(
     if surface is None:
         return inner
     try:
-        return covered(inner, tube_cover.fit_cover(surface, tube.shape, ends), ends)
+        return covered(inner, tube_cover.fit_cover(surface, tube.shape, ends), ends, _wall_sigma(scans, tube, rings))
     except InputError as error:
         unknown: Metrics = dict.fromkeys(COVER, float("nan"))
         return replace(inner, figures=inner.figures | unknown, lines=[*inner.lines, f"cover       none: {error}"])
 
 
-def covered(inner: Segmented, cover: Cover, ends: Array) -> Segmented:
-    """The tube with the body about it, between the same ends."""
-    values = 2 * cover.shape.radius, cover.rms_mm, cover.wall_mm
+def covered(inner: Segmented, cover: Cover, ends: Array, sigma_mm: float) -> Segmented:
+    """The tube with the body about it, between the same ends.
+
+    sigma_mm : standard deviation of the wall between both; NaN where it isn't known
+    """
+    values = 2 * cover.shape.radius, cover.rms_mm, cover.wall_mm, sigma_mm
     figures = inner.figures | dict(zip(COVER, values, strict=True))
     line = f"cover       {2 * cover.shape.radius:.3f} mm in diameter, RMS {cover.rms_mm:.3f} mm, wall {cover.wall_mm:.3f} mm"
+    line += f" ± {sigma_mm:.3f}" if np.isfinite(sigma_mm) else ""
     return Segmented(inner.meshes | {"cover": between(cover.shape, ends)}, figures, [*inner.lines, line], inner.overlays)
+
+
+def _wall_sigma(scans: Scans, tube: Tube, rings: Sequence[Ring]) -> float:
+    """Standard deviation, mm, of the place of a tube's wall towards the camera; NaN where the calibration's isn't known."""
+    if scans.probe is None or scans.probe.uncertainty is None:
+        return np.nan
+    used, up = np.unique(tube.frames), tube_cover.to_camera(tube.shape)
+    front = [rings[k].pixels[np.argmax(tube_wall.in_world(rings[k].pixels, scans.world_from_pixel[k]) @ up)] for k in used]
+    directions = np.broadcast_to(up, (len(used), 3))
+    placed = place_uncertainty.mean_sigma(scans.world_from_pixel, scans.probe, scans.errors, used, np.array(front), directions)
+    return float(np.hypot(placed, tube.sigma_mm))
 
 
 def _measure_tube(tube: Tube, of_scale_mm: float) -> Metrics:

@@ -28,7 +28,7 @@ def figures(**changes) -> dict:
     films = {f"{name}_track_{key}": value for name in ("wires", "bottom", "scan") for key, value in FILM.items()}
     scan = {f"scan_{key}": value for key, value in SCAN.items()}
     tumours = {f"scan_tumour{k}_{key}": value for k in range(3) for key, value in TUMOUR.items()}
-    return films | scan | tumours | CYLINDERS | changes
+    return films | scan | tumours | CYLINDERS | {"cover_wall_sigma_mm": 0.016} | changes
 
 
 def missed(found) -> set[str]:
@@ -57,10 +57,18 @@ def test_one_bad_session_is_enough(changes, row):
     assert missed([figures(), figures(**changes)]) == {row}
 
 
+@pytest.mark.parametrize(
+    ("sigma", "row"), [(0.01, "the same ratio, at most"), (0.03, "the same, squared over its predicted variance, mean, at least")]
+)
+def test_a_wall_that_claims_too_much_or_too_little_fails_its_row(sigma, row):
+    """Off by 0.016 mm in all sessions."""
+    assert missed([figures(cover_wall_sigma_mm=sigma)] * 2) == {row}
+
+
 @pytest.mark.parametrize("figure", CYLINDERS)
 def test_a_wrong_length_of_the_cylinders_fails_its_row(figure):
     """And mean and spread stand beside the worst."""
-    found = [figures(), figures(**{figure: -0.07})]
+    found = [figures(), figures(**{figure: -0.07}, cover_wall_sigma_mm=0.07 if "wall" in figure else 0.016)]
     rows = asked.missed(session_accuracy.sessions, session_accuracy.together(found), conditions="ideal")
     assert len(rows) == 1 and rows[0].measured == 0.07
     assert f"(mean {(CYLINDERS[figure] - 0.07) / 2:+.3f}, " in rows[0].what

@@ -129,7 +129,7 @@ def cylinders(result: Path, truth: Path, name: str) -> Metrics:
         "cover_wall_mm": tube_cover.wall_between(outer, inner),
     }
     errors: Metrics = {f"{figure[:-3]}_error_mm": found.get(figure, np.nan) - value for figure, value in true.items()}
-    return errors | {"tube_diameter_sigma_mm": found.get("tube_diameter_sigma_mm", np.nan)}
+    return errors | {name: found.get(name, np.nan) for name in ("tube_diameter_sigma_mm", "cover_wall_sigma_mm")}
 
 
 def _cylinder(truth: Path, part: PartName, name: str) -> Cylinder:

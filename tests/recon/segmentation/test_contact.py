@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from recon.freehand import sequences
-from recon.freehand.place_uncertainty import PlaceErrors
+from recon.freehand.place_uncertainty import GIVEN_MM, PlaceErrors
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
@@ -73,7 +73,7 @@ def test_sigma_is_what_errs_alike_and_what_averages(skin):
     own = np.tile(np.diag([0, 0, 0, 0.2, 0.2, 0.2]) ** 2, (COUNT, 1, 1))
     errors = PlaceErrors(own, np.eye(COUNT), nothing, np.zeros((COUNT, 4, 4)))
     found = contact.measure(sweep(0.0, along_beam, errors), skin)
-    assert found.sigma_mm == pytest.approx(np.linalg.norm([0.1, 0.2 / np.sqrt(COUNT), contact.GIVEN_MM]), rel=1e-6)
+    assert found.sigma_mm == pytest.approx(np.linalg.norm([0.1, 0.2 / np.sqrt(COUNT), GIVEN_MM]), rel=1e-6)
 
 
 def test_the_latency_shows_where_the_probe_moves_along_its_beam(skin):
@@ -83,7 +83,7 @@ def test_the_latency_shows_where_the_probe_moves_along_its_beam(skin):
     nothing = np.zeros((COUNT, 6, 6))
     errors = PlaceErrors(nothing, np.eye(COUNT), nothing, rates, lag_s=0.01)
     found = contact.measure(sweep(0.0, np.zeros((8, 8)), errors), skin)
-    assert found.sigma_mm == pytest.approx(np.hypot(0.05, contact.GIVEN_MM), rel=1e-6)
+    assert found.sigma_mm == pytest.approx(np.hypot(0.05, GIVEN_MM), rel=1e-6)
 
 
 @pytest.mark.parametrize(("off_mm", "said"), [(-0.4, "within the measured skin"), (0.0, ""), (0.8, ""), (1.6, "doesn't reach")])

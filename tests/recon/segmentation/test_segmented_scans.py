@@ -43,7 +43,10 @@ def test_a_cover_stands_beside_its_tube():
     tube = Cylinder("", np.array([0.0, 0, 600]), axis, 8.0)
     inner = Segmented({"tube": segmented_scans.between(tube, ends)}, {"tube_diameter_mm": 16.0}, ["tube"], [])
     cover = Cover(Cylinder("", np.array([5.0, 0, 601]), axis, 30.0), 0.02, 21.0)
-    found = segmented_scans.covered(inner, cover, ends)
-    assert found.figures == {"tube_diameter_mm": 16.0, "cover_diameter_mm": 60.0, "cover_rms_mm": 0.02, "cover_wall_mm": 21.0}
-    assert np.allclose(found.meshes["cover"].bounds[:, 0], [-20, 20]) and "wall 21.000 mm" in found.lines[-1]
+    found = segmented_scans.covered(inner, cover, ends, 0.05)
+    measured = {"cover_diameter_mm": 60.0, "cover_rms_mm": 0.02, "cover_wall_mm": 21.0, "cover_wall_sigma_mm": 0.05}
+    assert found.figures == {"tube_diameter_mm": 16.0} | measured
+    assert np.allclose(found.meshes["cover"].bounds[:, 0], [-20, 20]) and "wall 21.000 mm ± 0.050" in found.lines[-1]
+    unknown = segmented_scans.covered(inner, cover, ends, np.nan)
+    assert unknown.lines[-1].endswith("wall 21.000 mm")
     assert np.allclose(found.meshes["cover"].bounds[:, 2], [571, 631], atol=0.05)
