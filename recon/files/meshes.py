@@ -44,10 +44,12 @@ def join(parts: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """One mesh of several, with their normals, and the vertex attributes and grey levels that all of them have."""
     if len(parts) == 1:
         return parts[0]
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
-    places, normals = (np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "vertex_normals"))
-    whole = trimesh.Trimesh(places, faces, vertex_normals=normals, process=False, validate=False)
+    names = ("vertices", "faces", "vertex_normals")
+    # plain arrays, since each use of trimesh's own makes it hash them anew
+    places, faces, normals = ([np.asarray(getattr(part, name)) for part in parts] for name in names)
+    starts = np.cumsum([0, *map(len, places)])
+    faces = np.concatenate([corners + start for corners, start in zip(faces, starts, strict=False)])
+    whole = trimesh.Trimesh(np.concatenate(places), faces, vertex_normals=np.concatenate(normals), process=False, validate=False)
     for name in [name for name in parts[0].vertex_attributes if all(name in part.vertex_attributes for part in parts)]:
         whole.vertex_attributes[name] = np.concatenate([part.vertex_attributes[name] for part in parts])
     greys = [greys_of(part) for part in parts]

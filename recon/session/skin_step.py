@@ -10,6 +10,7 @@ from typing import Annotated
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from recon.capture import surface_part
 from recon.capture.surface_part import SurfaceCapture
@@ -138,10 +139,10 @@ def reconstruct(
             watch.say(describe_fusion(view, fused))
             raw = fused.first
             if fused.shared.any():
-                added.append(view._replace(raw=fused.second))
+                added.append((view._replace(raw=fused.second), fused.places))
     skin = surface_of(found, raw, by, limits, shots.name, clock)
     with clock.stage("seen_alone"):
-        skin = with_more(skin, by, added, limits)
+        skin = with_more(skin, added, limits)
     figures = skin.figures
     points, sigma = f"{figures['points']:,}".replace(",", " "), shown(figures["predicted_rms_mm"], ".3f", " mm")
     watch.say(f"triangulate {points} points, predicted sigma {sigma}, {figures['removed_px']} px removed as unsure")
@@ -221,12 +222,15 @@ def describe_fusion(view: View, fused: Fused) -> str:
     return f"warning     {name} improves no point: the calibration parts both by {fused.bias_px:.2f} projector px: {cause}"
 
 
-def with_more(skin: Skin, camera: Camera, views: Sequence[View], limits: Limits) -> Skin:
-    """A skin with what other cameras see of it beside the first one's points."""
+def with_more(skin: Skin, views: Sequence[tuple[View, NDArray[np.int64]]], limits: Limits) -> Skin:
+    """A skin with what other cameras see of it beside the first one's points.
+
+    views : of other cameras, each with the first one's pixels of its points, as in `second_view.Fused`
+    """
     meshes_of = [skin.mesh]
-    for view in views:
+    for view, places in views:
         more = surface_mesh.clean(view.raw, view.camera, view.found.modulation, limits)
-        more = second_view.alone(View(view.camera, view.found, more), skin.points, camera)
+        more = second_view.alone(view._replace(raw=more), places, skin.points)
         if np.isfinite(more.points).any():
             meshes_of.append(surface_mesh.mesh(more, view.camera, limits.max_slope, view.found.offset))
     mesh = meshes.join(meshes_of)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.compiled import kernel, njit
+from recon.compiled import njit
 from recon.geometry.camera import FARTHEST, Camera, distort_side_by_side
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import PointMap
@@ -67,6 +67,7 @@ class Fused:
     second: PointMap  # as it was, less the same
     shared: Mask  # (h, w) of the first, that both cameras measured alike
     apart: Mask  # (h, w) of the first, left out
+    places: NDArray[np.int64]  # (h, w) of the second: the first one's pixel at each of its points, flat; -1 outside
     bias_px: float  # projector px by which calibrations part both in one block of ten; NaN of too few points
 
 
@@ -81,13 +82,13 @@ def fuse(first: View, second: View, projector: Camera, limits: FusionLimits = LI
     bias = _bias(mine.misses, mine.expected, limits)
     if not bias <= limits.bias_px:
         none = np.zeros(mine.verdicts.shape, bool)
-        return Fused(first.raw, second.raw, none, none, bias)
+        return Fused(first.raw, second.raw, none, none, its.places, bias)
     gone, its_gone = mine.verdicts == THROUGH, its.verdicts == THROUGH
     gone, its_gone = gone | _about(its.places[its_gone], gone.shape), its_gone | _about(mine.places[gone], its_gone.shape)
     shared = (mine.verdicts == AGREES) & ~gone
-    points = np.where(shared[..., None], mine.points, first.raw.points)
-    better = View(first.camera, first.found, PointMap(points, np.where(shared, mine.sigma, first.raw.sigma))).less(gone)
-    return Fused(better.raw, second.less(its_gone).raw, shared, gone & np.isfinite(first.raw.points[..., 0]), bias)
+    mine.points[gone] = mine.sigma[gone] = np.nan
+    apart = gone & np.isfinite(first.raw.points[..., 0])
+    return Fused(PointMap(mine.points, mine.sigma), second.less(its_gone).raw, shared, apart, its.places, bias)
 
 
 def _about(places: NDArray[np.int64], shape: tuple[int, ...]) -> Mask:
@@ -101,9 +102,9 @@ class _Compared(NamedTuple):
     """What a second camera says of the points of a first, in the first one's pixels."""
 
     verdicts: NDArray[np.uint8]  # (h, w)
-    places: NDArray[np.int64]  # (h, w) the nearest pixel of the second, flat
-    points: NDArray[np.float32]  # (h, w, 3) mm, improved
-    sigma: NDArray[np.float32]  # (h, w) mm
+    places: NDArray[np.int64]  # (h, w) the nearest pixel of the second, flat; -1 outside
+    points: NDArray[np.float32]  # (h, w, 3) mm, improved where both agree
+    sigma: NDArray[np.float32]  # (h, w) mm, of these
     misses: NDArray[np.float32]  # (h, w) projector px that the second's map is off, of the first axis that both have
     expected: NDArray[np.float32]  # (h, w) projector px, standard deviation of these
 
@@ -125,44 +126,47 @@ def _compare(first: View, second: View, projector: Camera, limits: FusionLimits)
         maps += [np.float32(image if known else NOTHING), np.float32(NOTHING if noise is None or not known else noise)]
     devices = [(camera.camera_from_world, camera.matrix, camera.coefficients) for camera in (second.camera, projector)]
     eyes = np.stack([first.camera.centre, second.camera.centre])
-    away = np.linalg.norm(second.raw.points - second.camera.centre.astype(np.float32), axis=-1)
     rules = _Rules(limits.reach_mm, limits.apart_sigma, limits.apart_px)
     unknown = np.full((2, *shape), np.nan, np.float32)
-    found = _Compared(np.zeros(shape, np.uint8), np.zeros(shape, np.int64), points.copy(), sigma.copy(), *unknown)
-    in_threads(_compare_rows, len(points), points, sigma, away, eyes, *devices, tuple(maps), rules, *found)
+    verdicts, places = np.zeros(shape, np.uint8), np.full(shape, -1, np.int64)
+    found = _Compared(verdicts, places, points.copy(), sigma.copy(), *unknown)
+    in_threads(_compare_rows, len(points), points, sigma, second.raw.points, eyes, *devices, tuple(maps), rules, *found)
     return found
 
 
-@kernel
+@njit(nogil=True, noalias=True, error_model="numpy")
 def _compare_rows(
-    first, end, points, sigma, away, eyes, camera, projector, maps, rules, verdicts, places, made, noises, misses, expected
+    first, end, points, sigma, others, eyes, camera, projector, maps, rules, verdicts, places, made, noises, misses, expected
 ):
     """Rows `first` to `end` (not included)."""
     columns, sigma_columns, rows, sigma_rows = maps
+    width, (its_height, its_width) = points.shape[1], others.shape[:2]
+    along, seen, lit = np.empty((3, width)), np.empty((3, 2, width)), np.empty((3, 2, width))
     for j in range(first, end):
-        for i in range(points.shape[1]):
-            x, y, z = np.float64(points[j, i, 0]), np.float64(points[j, i, 1]), np.float64(points[j, i, 2])
-            if not np.isfinite(x):
+        for k in range(3):  # before the points of a row, at them, and behind
+            for i in range(width):
+                x, y, z = np.float64(points[j, i, 0]), np.float64(points[j, i, 1]), np.float64(points[j, i, 2])
+                dx, dy, dz = x - eyes[0, 0], y - eyes[0, 1], z - eyes[0, 2]
+                reach = (k - 1) * rules.reach_mm / np.sqrt(dx * dx + dy * dy + dz * dz)
+                along[0, i], along[1, i], along[2, i] = x + reach * dx, y + reach * dy, z + reach * dz
+            _project(along, camera, seen[k])
+            _project(along, projector, lit[k])
+        for i in range(width):
+            u, v = seen[1, 0, i], seen[1, 1, i]
+            if not (u >= -0.5 and v >= -0.5 and u < its_width - 0.5 and v < its_height - 0.5):
                 continue
-            dx, dy, dz = x - eyes[0, 0], y - eyes[0, 1], z - eyes[0, 2]
-            reach = rules.reach_mm / np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = reach * dx, reach * dy, reach * dz
-            u0, v0 = _pixel(x - dx, y - dy, z - dz, camera)
-            u, v = _pixel(x, y, z, camera)
-            u1, v1 = _pixel(x + dx, y + dy, z + dz, camera)
-            s0, t0 = _pixel(x - dx, y - dy, z - dz, projector)
-            s, t = _pixel(x, y, z, projector)
-            s1, t1 = _pixel(x + dx, y + dy, z + dz, projector)
+            row, column = int(v + 0.5), int(u + 0.5)
+            places[j, i] = row * its_width + column
             doubt = np.float64(sigma[j, i])
-            own = 1 / max(doubt, EXACT) ** 2 if doubt >= 0 else (s1 - s0) ** 2 / (2 * rules.reach_mm) ** 2  # of 1 px, as unknown
+            slope = (lit[2, 0, i] - lit[0, 0, i]) / (2 * rules.reach_mm)
+            own = 1 / max(doubt, EXACT) ** 2 if doubt >= 0 else slope**2  # of 1 px, as unknown
             information, right, miss, alike = own, 0.0, np.nan, True
             for axis in range(2):
-                if axis == 0:
-                    image, noise, before, here, after = columns, sigma_columns, s0, s, s1
-                else:
-                    image, noise, before, here, after = rows, sigma_rows, t0, t, t1
-                left = _read(image, u, v) - here
-                slope = (_read(image, u1, v1) - after - _read(image, u0, v0) + before) / (2 * rules.reach_mm)
+                image, noise = (columns, sigma_columns) if axis == 0 else (rows, sigma_rows)
+                left = _read(image, u, v) - lit[1, axis, i]
+                after = _read(image, seen[2, 0, i], seen[2, 1, i]) - lit[2, axis, i]
+                before = _read(image, seen[0, 0, i], seen[0, 1, i]) - lit[0, axis, i]
+                slope = (after - before) / (2 * rules.reach_mm)
                 its = _read(noise, u, v)
                 if np.isnan(left) or np.isnan(slope):
                     continue
@@ -177,31 +181,42 @@ def _compare_rows(
             if np.isnan(miss):
                 continue
             misses[j, i] = miss
-            row, column = int(v + 0.5), int(u + 0.5)
-            places[j, i] = row * away.shape[1] + column
-            if not alike and np.isnan(away[row, column]):
+            x, y, z = points[j, i]
+            if alike:
+                verdicts[j, i] = AGREES
+                step = right / information / _distance(x, y, z, eyes[0])
+                made[j, i, 0] = x + step * (x - eyes[0, 0])
+                made[j, i, 1] = y + step * (y - eyes[0, 1])
+                made[j, i, 2] = z + step * (z - eyes[0, 2])
+                noises[j, i] = np.nan if np.isnan(doubt) else 1 / np.sqrt(information)
                 continue
-            if not alike:
-                distance = np.sqrt((x - eyes[1, 0]) ** 2 + (y - eyes[1, 1]) ** 2 + (z - eyes[1, 2]) ** 2)
-                verdicts[j, i] = HIDDEN if away[row, column] < distance else THROUGH
-                continue
-            verdicts[j, i] = AGREES
-            step = right / information / rules.reach_mm
-            made[j, i, 0], made[j, i, 1], made[j, i, 2] = x + step * dx, y + step * dy, z + step * dz
-            noises[j, i] = np.nan if np.isnan(doubt) else 1 / np.sqrt(information)
+            xs, ys, zs = others[row, column]
+            if not np.isnan(xs):
+                hidden = _distance(xs, ys, zs, eyes[1]) < _distance(x, y, z, eyes[1])
+                verdicts[j, i] = HIDDEN if hidden else THROUGH
 
 
 @njit(inline="always", error_model="numpy")
-def _pixel(x, y, z, device):
-    """The pixel of a point; NaN behind the device or past its lens's turn."""
+def _distance(x, y, z, eye):
+    """Of a point from an eye, in mm."""
+    return np.sqrt((x - eye[0]) ** 2 + (y - eye[1]) ** 2 + (z - eye[2]) ** 2)
+
+
+@njit(inline="always", error_model="numpy")
+def _project(points, device, pixels):
+    """A device's pixels : (2, n) of points : (3, n); NaN behind the device or past its lens's turn.
+
+    Without branches, so that points share vector instructions.
+    """
     place, matrix, coefficients = device
-    a = place[0, 0] * x + place[0, 1] * y + place[0, 2] * z + place[0, 3]
-    b = place[1, 0] * x + place[1, 1] * y + place[1, 2] * z + place[1, 3]
-    c = place[2, 0] * x + place[2, 1] * y + place[2, 2] * z + place[2, 3]
-    if c <= 0 or a * a + b * b > coefficients[FARTHEST] * c * c:
-        return np.nan, np.nan
-    xd, yd = distort_side_by_side(a / c, b / c, coefficients)
-    return matrix[0, 0] * xd + matrix[0, 1] * yd + matrix[0, 2], matrix[1, 1] * yd + matrix[1, 2]
+    for i in range(points.shape[1]):
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        a = place[0, 0] * x + place[0, 1] * y + place[0, 2] * z + place[0, 3]
+        b = place[1, 0] * x + place[1, 1] * y + place[1, 2] * z + place[1, 3]
+        c = place[2, 0] * x + place[2, 1] * y + place[2, 2] * z + place[2, 3]
+        c = c if (c > 0) & (a * a + b * b <= coefficients[FARTHEST] * c * c) else np.nan
+        xd, yd = distort_side_by_side(a / c, b / c, coefficients)
+        pixels[0, i], pixels[1, i] = matrix[0, 0] * xd + matrix[0, 1] * yd + matrix[0, 2], matrix[1, 1] * yd + matrix[1, 2]
 
 
 @njit(inline="always")
@@ -223,21 +238,14 @@ def _read(image, u, v):
     return (1 - b) * upper + b * ((1 - a) * image[j + 1, i] + a * image[j + 1, i + 1])
 
 
-def alone(second: View, points: PointMap, camera: Camera, limits: FusionLimits = LIMITS) -> PointMap:
-    """Points of a second camera, of its size, that the first one has none of, and one pixel more for the meshes to meet.
+def alone(second: View, places: NDArray[np.int64], points: PointMap, limits: FusionLimits = LIMITS) -> PointMap:
+    """Points of a second camera that the first one has none of, and one pixel more for the meshes to meet.
 
-    points : of the first, whose camera is given
+    places : (h, w) of the second, as in `Fused`
+    points : of the first
     """
-    rows, columns = np.nonzero(np.isfinite(second.raw.points[..., 0]))
-    places = second.raw.points[rows, columns].astype(float)
-    height, width = points.points.shape[:2]
-    with np.errstate(invalid="ignore"):
-        at = np.rint(camera.project(places))
-        inside = ((at >= 0) & (at < [width, height])).all(axis=1)
-    u, v = np.where(inside[:, None], at, 0).astype(int).T
-    with np.errstate(invalid="ignore"):
-        covered = np.zeros(second.raw.sigma.shape, bool)
-        covered[rows, columns] = inside & (np.linalg.norm(points.points[v, u] - places, axis=1) < limits.beside_mm)
+    apart = np.linalg.norm(points.points.reshape(-1, 3)[places] - second.raw.points, axis=-1)
+    covered = (places >= 0) & (apart < limits.beside_mm)
     return second.less(ndimage.binary_erosion(covered, np.ones((3, 3), bool))).raw
 
 

@@ -99,7 +99,7 @@ def test_what_deceives_the_second_camera_does_no_harm(views, off_px):
     second = deceived(views[1], off_px)
     fused = second_view.fuse(views[0], second, PROJECTOR)
     assert np.nanmax(np.abs(along(fused.first.points))) < 8 * np.nanmax(views[0].raw.sigma)
-    more = second_view.alone(second._replace(raw=fused.second), fused.first, CAMERA)
+    more = second_view.alone(second._replace(raw=fused.second), fused.places, fused.first)
     wrong = np.abs(along(more.points, BESIDE)) > 8 * np.nanmax(views[1].raw.sigma)
     assert wrong.sum() < 0.05 * 30 * 40
 
@@ -154,7 +154,8 @@ def test_alone_is_what_the_first_camera_lacks(views):
     """A hole in camera 1's points is filled by camera 2's, and by a rim of a pixel or two; nothing else is doubled."""
     points = views[0].raw.points.copy()
     points[PATCH] = np.nan
-    more = second_view.alone(views[1], replace(views[0].raw, points=points), CAMERA)
+    fused = second_view.fuse(*views, PROJECTOR)
+    more = second_view.alone(views[1], fused.places, replace(views[0].raw, points=points))
     places = more.points[np.isfinite(more.points[..., 0])]
     at = np.rint(CAMERA.project(places)).astype(int)
     inside = ((at >= 0) & (at < SIZE)).all(axis=1)
