@@ -83,7 +83,7 @@ group=choice takes another file of a group, or one of your own, which may begin 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # of a damaged image we say so ourselves, in one line
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: one order of sums, the same bytes on any number of cores
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of what is loaded from now on, see `linear_algebra`
     if isinstance(sys.stdout, TextIOWrapper):  # names of files may hold what the terminal has no letters for
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -161,14 +161,15 @@ def _run(arguments: list[str]) -> int:
     for override in overrides:
         if override.startswith("-"):
             raise InputError(f"{verb.name}: {override}: unknown option; fields are given as field=value")
-    from recon import interrupts
+    from recon import interrupts, linear_algebra
     from sonotwin import config, first_use
 
     first_use.announce()  # imports may compile, too
     with interrupts.held_back():  # an interrupt leaves extensions half imported, and other libraries' errors would hide it
         module = import_module(verb.module)
         settings = config.load(verb.name, overrides, module.Config)
-    return module.run(settings) or 0
+    with linear_algebra.on_one_thread():
+        return module.run(settings) or 0
 
 
 def _find(name: str) -> Verb:

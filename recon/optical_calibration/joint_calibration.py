@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from recon import arguments
+from recon import arguments, linear_algebra
 from recon.errors import InputError
 from recon.estimation.equations import Undetermined
 from recon.geometry import board_shape, usual_lenses
@@ -96,6 +96,7 @@ class Result:
         return reprojection_rms(self.observations, self.adjustment)
 
 
+@linear_algebra.on_one_thread()
 def calibrate(
     sightings: Sequence[Sighting], board: Board, sizes: Mapping[str, Size], settings: Settings | None = None, name: str = "board"
 ) -> Result:

@@ -7,7 +7,7 @@ from enum import Enum, auto
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import arguments
+from recon import arguments, linear_algebra
 from recon.board_detection.detect import BoardNotFound, Detection, detect
 from recon.errors import InputError
 from recon.model.boards import Board
@@ -61,6 +61,7 @@ class Sighting:
     linearity: Linearity = LINEAR  # of the fringes' light
 
 
+@linear_algebra.on_one_thread()
 def sight(
     name: str, board: Board, lit: Mapping[str, Image], fringes: Image | None, patterns: Patterns | None, bits: Mapping[str, int]
 ) -> Sighting:

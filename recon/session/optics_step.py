@@ -7,6 +7,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
+from recon import linear_algebra
 from recon.capture import board_part, calibration_files, manifest
 from recon.capture.board_part import BoardCapture
 from recon.capture.layouts import meza2021
@@ -82,6 +83,7 @@ def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> N
     watch.say(f"wrote       {out}/{{{','.join(names)}}}")
 
 
+@linear_algebra.on_one_thread()
 def calibrate(
     captured: BoardCapture,
     settings: joint_calibration.Settings | None = None,

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import model_validator
 
+from recon import linear_algebra
 from recon.capture import calibration_files, lag_files, manifest, probe_files, target_files
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPart, is_sweep, sweep_part
 from recon.errors import Implausible, InputError
@@ -111,6 +112,7 @@ class Sources:
         return {"files": files_of(folders), "parts": described, "devices": self.held.model_dump(mode="json")["devices"]}
 
 
+@linear_algebra.on_one_thread()
 def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command, watch: Watch = SILENT) -> Store:
     """Do all steps that the capture allows; returns what was done, and what could not be.
 

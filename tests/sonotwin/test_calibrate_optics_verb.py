@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 import sonotwin
 from recon.board_detection.kinds.chessboard import Chessboard
@@ -22,6 +23,7 @@ from recon.model.calibration import PRINT_SCALE, Calibration, with_scale
 from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.session.optics_step import dropped
 from sonotwin.cli import main
+from sonotwin.verbs import reconstruct
 from tests.recon import board_views
 
 SIZE = (320, 256)
@@ -321,3 +323,13 @@ def test_other_folders_are_not_replaced(session, tmp_path, capsys):
     found = complaint(capsys, f"capture={session / 'capture'}", f"out={out}")
     assert "expected a new or empty folder, or one that calibrate-optics wrote" in found
     assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_a_session_calibrates_to_the_same_bytes_whatever_threads_linear_algebra_had(session, tmp_path):
+    """A script has loaded NumPy, with a thread a core, before it runs a session; the command begins with one thread."""
+    capture, alone, result = session / "capture", tmp_path / "alone", tmp_path / "result"
+    with threadpool_limits(1, "blas"):
+        assert main(["calibrate-optics", f"capture={capture}", f"out={alone}"]) == 0
+    with threadpool_limits(2, "blas"):
+        reconstruct.run(reconstruct.Config(rig=sonotwin.read_rig(), capture=capture, out=result))
+    assert (result / "optics" / "optics.yaml").read_bytes() == (alone / "optics.yaml").read_bytes()

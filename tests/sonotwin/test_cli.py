@@ -6,7 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from recon import user_cache
 from recon.errors import InputError
@@ -37,6 +39,20 @@ def failing(monkeypatch):
         monkeypatch.setattr("sonotwin.verbs.doctor.run", run)
 
     return make
+
+
+def test_linear_algebra_has_one_thread_in_a_process_that_gave_it_more(monkeypatch):
+    """A notebook has loaded NumPy before it runs a verb: what the environment says is read no more."""
+    counts = set[int]()
+
+    def run(config):
+        counts.update(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+
+    monkeypatch.setattr("sonotwin.verbs.doctor.run", run)
+    assert np.linalg.det(np.eye(2)) == 1
+    with threadpool_limits(2, "blas"):
+        assert cli.main(["doctor"]) == 0
+    assert counts == {1}
 
 
 def test_verbs_are_in_the_table():
