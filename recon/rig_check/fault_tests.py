@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 RIVAL = np.log(20.0)  # of evidence, below the best one's: another part that may be it
 UNSEEN = 1e-6  # of the largest eigenvalue: a direction of motion that measurements don't show
 SMALLEST = -600.0  # logarithm of a chance, below which numbers have no digits left
+MANY = 200  # degrees of freedom, that show noise to 5 %: it is taken as found where it is smaller than predicted, too
+LEAST = 0.1  # of the predicted noise: less is rounding
 MOST_NAMED = 3  # parts: beyond, all is to be calibrated anew anyway
 
 
@@ -67,13 +69,16 @@ def unexplained(equations: Equations, used: NDArray[np.bool_]) -> Array:
 
 
 def noise_factor(equations: Equations) -> float:
-    """Standard deviation of the residuals that no error and no motion explains, over the predicted one; at least 1."""
+    """Standard deviation of the residuals that no error and no motion explains, over the predicted one.
+
+    At least 1 where few equations show it.
+    """
     explained = _scaled(equations)
     freedom = len(explained) - int(np.linalg.matrix_rank(explained, rtol=UNSEEN))
     if freedom < 1:
         return 1.0
     left = unexplained(equations, np.ones(len(explained), bool))
-    return max(float(np.sqrt(left @ left / freedom)), 1.0)
+    return max(float(np.sqrt(left @ left / freedom)), LEAST if freedom >= MANY else 1.0)
 
 
 def _scaled(equations: Equations) -> Array:
@@ -112,9 +117,9 @@ def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
 
 def _tested(equations: Equations, fault: Fault) -> _Test:
     """Test a part by itself."""
-    slopes, y, spread = fault.slopes * fault.usual, equations.residuals, equations.spread
-    weighed = slopes - spread @ np.linalg.solve(np.eye(spread.shape[1]) + spread.T @ spread, spread.T @ slopes)  # Woodbury
-    information, right = weighed.T @ slopes, weighed.T @ y
+    slopes = fault.slopes * fault.usual
+    weighed = _weighed(equations, slopes)
+    information, right = weighed.T @ slopes, weighed.T @ equations.residuals
     information = (information + information.T) / 2
     values, axes = np.linalg.eigh(information)
     shown = values > UNSEEN * values.max()
@@ -126,6 +131,22 @@ def _tested(equations: Equations, fault: Fault) -> _Test:
     covariance = posterior * np.outer(sizes, sizes)
     finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False)
     return _Test(finding, evidence, statistic)
+
+
+def _weighed(equations: Equations, slopes: Array) -> Array:
+    """Slopes : (m, k) times the inverse covariance of the residuals where nothing moved."""
+    spread = equations.spread
+    return slopes - spread @ np.linalg.solve(np.eye(spread.shape[1]) + spread.T @ spread, spread.T @ slopes)  # Woodbury
+
+
+def best_chance(equations: Equations, part: str, motion: Array, alarm_sigma: float) -> float:
+    """Chance at which a motion : (k,) is found by a test that knows it but for its sign and size; no test finds it more often.
+
+    Source: Neyman & Pearson 1933.
+    """
+    effect = equations.faults[part].slopes @ motion
+    sigma = float(np.sqrt(effect @ _weighed(equations, effect[:, None])[:, 0]))
+    return float(stats.norm.sf(alarm_sigma - sigma) + stats.norm.sf(alarm_sigma + sigma))
 
 
 def as_sigma(statistic: float, freedom: int) -> float:

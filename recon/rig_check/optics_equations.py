@@ -150,7 +150,7 @@ def assemble(
 def combine(
     film: DeviceRows | None, fringes: DeviceRows | None, target: Target, known: Uncertainty, names: Sequence[str]
 ) -> DeviceRows:
-    """All rows. Noise that is larger than predicted is taken as found, of film and fringes each by itself."""
+    """All rows. Noise is taken as found, of film and fringes each by itself; smaller than predicted by many equations alone."""
     parts = [rows for rows in (film, fringes) if rows is not None]
     parts = [rows.over(fault_tests.noise_factor(_equations(rows, target, known, names))) for rows in parts]
     return DeviceRows(*map(np.concatenate, zip(*parts, strict=True)))

@@ -12,7 +12,7 @@ from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations, fault_tests, optics_equations
 from recon.rig_check.bottom_equations import CLOCK, PROBE, Known, Lines
-from recon.rig_check.fault_tests import Finding
+from recon.rig_check.fault_tests import Equations, Finding
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, TARGET, Matches
 from recon.tracking.pose_fit import Sighting, meet
 
@@ -63,6 +63,11 @@ def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target
 
     known : the calibration's uncertainty, with what is usual since it was made, as of `recon.model.calibration.in_use`.
     """
+    return of_equations(equations_of(seen, calibration, known, target), seen, calibration, target, alarm_sigma)
+
+
+def equations_of(seen: Optics, calibration: Calibration, known: Uncertainty, target: Target) -> Equations:
+    """Equations of cameras, projector and target by all that was taken; points that disagree with most others are left out."""
     cameras, names = calibration.cameras, optics_equations.parameters(known, list(calibration.cameras))
     film = None if seen.film is None else optics_equations.of_film(seen.film, target, names)
     fringes = None
@@ -70,7 +75,14 @@ def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target
         each = 2 * len(seen.matches.axes) - 1
         fringes = optics_equations.of_fringes(seen.matches, cameras, target, names)
         fringes = optics_equations.agreeing(fringes, target, known, names, each)
-    findings = fault_tests.find(optics_equations.assemble(film, fringes, target, known, names), alarm_sigma)
+    return optics_equations.assemble(film, fringes, target, known, names)
+
+
+def of_equations(
+    equations: Equations, seen: Optics, calibration: Calibration, target: Target, alarm_sigma: float
+) -> list[Verdict]:
+    """Verdicts on cameras, projector and target by their equations."""
+    cameras, findings = calibration.cameras, fault_tests.find(equations, alarm_sigma)
     axes = (0,) if seen.matches is None else seen.matches.axes
     points = np.concatenate([_film_points(seen), _lit_points(seen, cameras)])
     effects = {

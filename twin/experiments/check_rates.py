@@ -1,6 +1,6 @@
 """Rates at which the check of a rig finds and names what has moved, and of its false alarms: rows of the table of accuracy."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Literal, NamedTuple
@@ -12,7 +12,7 @@ from recon.geometry import rigid
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, Uncertainty, in_use
 from recon.model.rig import Rig
 from recon.model.tracks import Track
-from recon.rig_check import verdicts
+from recon.rig_check import bottom_equations, fault_tests, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.verdicts import Optics, Verdict
 from scenes.board_poses import Config as Poses
@@ -53,6 +53,13 @@ MOVES: Moves = {
 }
 
 
+class Told(NamedTuple):
+    """Of a drawn rig after a move."""
+
+    verdicts: list[Verdict]
+    limit: float = np.nan  # chance at which no test finds the move more often
+
+
 class Laboratory(NamedTuple):
     """A calibrated rig, and how it is used."""
 
@@ -83,26 +90,31 @@ def laboratory(rig: Rig, life: Conditions, drift_px: float) -> Laboratory:
     return Laboratory(rig, life, optics, known)
 
 
-def _counted(checked: Callable[[int, Devices], dict[str, list[Verdict]]], lab: Laboratory, rigs: int) -> Figures:
-    """Shares of drawn rigs, of the verdicts on each by the move: what moved is found, or found alone; and false alarms."""
-    alarms, found, named = set(), Counter(), Counter()
+def _counted(checked: Callable[[int, Devices], dict[str, Told]], lab: Laboratory, rigs: int) -> Figures:
+    """Shares of drawn rigs, of the verdicts on each by the move: what moved is found, or found alone; and false alarms.
+
+    Beside them the largest share that any test finds.
+    """
+    alarms, found, named, limit = set(), Counter(), Counter(), defaultdict(float)
     for k in range(rigs):
         true = drawn_check.drawn_rig(lab.optics.cameras, lab.known, np.random.default_rng([SEED, k, 0]))
         for move, seen in checked(k, true).items():
-            moved = {one.part for one in seen if one.state == "moved"}
+            moved = {one.part for one in seen.verdicts if one.state == "moved"}
             part = move.partition(",")[0]
             if part.startswith("none"):
                 alarms |= {k} if moved else set()
                 continue
-            rivals = {one.part for one in seen if one.state == "maybe"}
+            rivals = {one.part for one in seen.verdicts if one.state == "maybe"}
             found[move] += part in moved | rivals
             named[move] += moved == {part} and not rivals
+            limit[move] += seen.limit
     sizes = {"turn_deg": TURN_DEG, "shift_mm": SHIFT_MM, "bend_mm": BEND_MM, "lag_ms": 1e3 * LAG_S, "warm_px": WARM_PX}
-    shares = {f"{move}: {how}": count[move] / rigs for how, count in (("found", found), ("named", named)) for move in count}
+    counts = {"found": found, "named": named, "limit": limit}
+    shares = {f"{move}: {how}": count[move] / rigs for how, count in counts.items() for move in count}
     return sizes | shares | {"rigs": rigs, "alarms": len(alarms) / rigs}
 
 
-def _optics(lab: Laboratory, moves: Moves, true: Devices, k: int) -> dict[str, list[Verdict]]:
+def _optics(lab: Laboratory, moves: Moves, true: Devices, k: int) -> dict[str, Told]:
     """Verdicts on the devices, by a film and fringes, after each move."""
     told, known = {}, lab.optics.cameras
     for number, (move, change) in enumerate(moves.items()):
@@ -112,11 +124,16 @@ def _optics(lab: Laboratory, moves: Moves, true: Devices, k: int) -> dict[str, l
         target = drawn_check.measured(printed, TARGET_MM, rng)
         film = drawn_check.drawn_film(moved, known, printed, Noise().circle_px, rng)
         matches = drawn_check.drawn_matches(moved, known, axes, Noise().column_px, rng)
-        told[move] = verdicts.of_optics(Optics(film, matches), lab.optics, lab.known, target, ALARM_SIGMA)
+        seen, part = Optics(film, matches), move.partition(",")[0]
+        equations = verdicts.equations_of(seen, lab.optics, lab.known, target)
+        told[move] = Told(verdicts.of_equations(equations, seen, lab.optics, target, ALARM_SIGMA))
+        if part in moved:
+            motion = rigid.difference(true[part].camera_from_world, moved[part].camera_from_world)
+            told[move] = told[move]._replace(limit=fault_tests.best_chance(equations, part, motion, ALARM_SIGMA))
     return told
 
 
-def _tank(lab: Laboratory, true: Devices, transducer: Transducer, k: int) -> dict[str, list[Verdict]]:
+def _tank(lab: Laboratory, true: Devices, transducer: Transducer, k: int) -> dict[str, Told]:
     """Verdicts on probe and clock: as they are, with a bent bracket, and with a clock that is off."""
     rig, optics, pair = lab.rig, lab.optics, (true["cam1"], true["cam2"])
     eye = Eye(pair, drawn_session.pair(optics), lab.known, rig.target, rig.target, Noise().circle_px, 1.0)
@@ -133,5 +150,11 @@ def _tank(lab: Laboratory, true: Devices, transducer: Transducer, k: int) -> dic
         clocks = Clocks(KNOWN_LAG_S + (LAG_S if move == "clock" else 0.0))
         lines = drawn_check.drawn_lines(path, scale, size, clocks, rng)
         calibrated = Known(probe, KNOWN_LAG_S + LAG_SIGMA_S * float(rng.standard_normal()), LAG_SIGMA_S)
-        told[move] = verdicts.of_bottom(lines, track, calibrated, size, SPEED_MM_S, ALARM_SIGMA)[0]
+        told[move] = Told(verdicts.of_bottom(lines, track, calibrated, size, SPEED_MM_S, ALARM_SIGMA)[0])
+        motion = {"probe": rigid.difference(design, held), "clock": np.array([LAG_S])}.get(move)
+        if motion is not None:
+            bottom = bottom_equations.fit(lines, track, calibrated)
+            equations = bottom_equations.equations(lines, track, calibrated, bottom)
+            limit = fault_tests.best_chance(equations, move, motion, ALARM_SIGMA)
+            told[move] = told[move]._replace(limit=limit)
     return told

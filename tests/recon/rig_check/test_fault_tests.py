@@ -82,6 +82,26 @@ def test_larger_noise_is_measured(equations, rng):
     assert fault_tests.noise_factor(Equations(1e-3 * noisy.residuals, moved.spread, moved.faults)) == 1
 
 
+def test_noise_of_many_equations_is_as_found(rng):
+    """A quarter of the predicted, by 396 degrees of freedom, to 5 standard deviations: so a motion shows four times as well."""
+    spread, slopes = rng.standard_normal((400, 2)), rng.standard_normal((400, 2))
+    quiet = Equations(0.25 * rng.standard_normal(400) + spread @ [3.0, -2.0], spread, {"first": Fault(slopes, np.ones(2))})
+    assert fault_tests.noise_factor(quiet) == pytest.approx(0.25, rel=5 / np.sqrt(2 * 396))
+
+
+def test_no_test_finds_more_than_the_best_chance(equations, rng):
+    """A motion of 3 sigma, tested along itself, is found as often as said, to 5 standard deviations; by any motion less often."""
+    effect = equations.faults["first"].slopes[:, 0]
+    weight = np.linalg.solve(np.eye(40) + equations.spread @ equations.spread.T, effect)
+    step = 3.0 / np.sqrt(effect @ weight)
+    draws = [measured(equations, rng, (step,)) for _ in range(500)]
+    found = np.mean([abs(one.residuals @ weight) > 2.5 * np.sqrt(effect @ weight) for one in draws])
+    chance = fault_tests.best_chance(equations, "first", np.array([step, 0, 0, 0, 0, 0]), 2.5)
+    assert chance == pytest.approx(0.691, abs=0.001)  # of a normal number beyond -0.5
+    assert found == pytest.approx(chance, abs=5 * np.sqrt(0.25 / 500))
+    assert np.mean([fault_tests.find(one, 2.5)["first"].sigma > 2.5 for one in draws]) < chance - 0.1
+
+
 @pytest.mark.parametrize(("statistic", "freedom", "sigma"), [(9.0, 1, 3.0), (22.4577, 6, 3.2905), (1e4, 1, 100.0)])
 def test_statistics_in_standard_deviations(statistic, freedom, sigma):
     """Of one degree of freedom the root; of six, 22.4577 has a chance of 0.001 (tables of chi-square)."""
