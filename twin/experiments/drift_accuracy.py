@@ -1,6 +1,6 @@
 """Correction of drawn drift: what a session's fringes and films leave of it, and whether that is what they say."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration
 from recon.optical_calibration import uncertainty
 from recon.rig_check import drift
 from recon.rig_check.drift import Drift
-from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
+from recon.rig_check.optics_equations import PROJECTOR, points_by_light
 from scenes.board_poses import Config as Poses
 from twin import conditions
 from twin.experiments import drawn_check, drawn_session
@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 SEED = 3046
 VIEWS = 24  # of the target, as many as `sonotwin correct-optics` takes
 COLUMNS = (0,)  # axes of the fringes
+APART_MM = (50.0, 100.0)  # of two points of the skin whose distance is measured
+KINDS = ("uncorrected", "corrected", "new")  # calibrations: as it was, corrected by the session, and made anew that day
 LEAST = 1e-9  # variance of a principal axis of the correlation, below which rounding decides
 
 
@@ -32,23 +34,41 @@ class Outcome(NamedTuple):
     """Of one drawn session."""
 
     inside: bool  # what it shows of the devices, within its 95 % region
-    apart_mm: Array  # (2,) mean displacement of the skin along camera 1's axis against both cameras: uncorrected, corrected
-    sigma_mm: Array  # (2,) of these, as predicted
-    skin_mm: Array  # (2,) RMS displacement of the skin itself in camera 1's frame: uncorrected, corrected
+    errors: "tuple[Errors, Errors, Errors]"  # of KINDS
     size: float
     surprise: float
 
 
-def sessions(setup: Setup, sessions: int = 200, times: float = 1.0, views: int = VIEWS, fringes: bool = True) -> Figures:
+class Errors(NamedTuple):
+    """Of the skin, as a calibration measures it."""
+
+    apart_mm: float  # mean displacement along camera 1's axis against both cameras
+    sigma_mm: float  # of it, as predicted
+    skin_mm: float  # RMS displacement in camera 1's frame
+    shape_mm: float  # RMS displacement less the rigid motion that fits best
+    distance_mm: float  # RMS error of distances of 50 to 100 mm
+    distance_ppm: float  # of these, relative
+
+
+def sessions(
+    setup: Setup,
+    sessions: int = 200,
+    times: float = 1.0,
+    views: int = VIEWS,
+    fringes: bool = True,
+    scale: float = PRINT_SCALE,
+    life: Literal["ideal", "lifelike"] = "lifelike",
+) -> Figures:
     """Figures over sessions of a rig that was calibrated once, and drifted anew in each.
 
     times : drift over the usual one
     views : of the target; with `fringes`, what a session shows
+    scale : relative standard deviation of the board's scale
+    life : conditions under which board and target were printed
     """
-    life = setup.conditions("lifelike")
-    optics = drawn_session.calibrated_optics(setup.rig, life, Noise(), Poses(), SEED)
-    found = [session(setup, optics, times, views, fringes, k) for k in range(sessions)]
-    apart, sigma, skin = (np.array([getattr(one, name) for one in found]) for name in ("apart_mm", "sigma_mm", "skin_mm"))
+    optics = drawn_session.calibrated_optics(setup.rig, setup.conditions(life), Noise(), Poses(), SEED)
+    found = [session(setup, optics, times, views, fringes, scale, life, k) for k in range(sessions)]
+    apart, sigma, *rms = np.array([one.errors for one in found]).transpose(2, 0, 1)
     figures = {
         "sessions": sessions,
         "times": times,
@@ -58,44 +78,70 @@ def sessions(setup: Setup, sessions: int = 200, times: float = 1.0, views: int =
         "size_median": float(np.median([one.size for one in found])),
         "beyond_percent": 100 * float(np.mean(np.abs(apart[:, 1]) > 3 * sigma[:, 1])),
     }
-    for k, name in enumerate(("uncorrected", "corrected")):
+    for k, name in enumerate(KINDS):
         figures |= {
             f"apart_rms_mm_{name}": float(np.sqrt(np.mean(apart[:, k] ** 2))),
             f"apart_worst_mm_{name}": float(np.abs(apart[:, k]).max()),
             f"apart_over_sigma_{name}": float(np.mean((apart[:, k] / sigma[:, k]) ** 2)),
-            f"skin_rms_mm_{name}": float(np.sqrt(np.mean(skin[:, k] ** 2))),
         }
-    return figures
+        sizes = {"skin_rms_mm": rms[0], "shape_rms_mm": rms[1], "distance_rms_mm": rms[2], "distance_ppm": rms[3]}
+        figures |= {f"{size}_{name}": float(np.sqrt(np.mean(errors[:, k] ** 2))) for size, errors in sizes.items()}
+    over = {size: figures[f"{size}_rms_mm_corrected"] / figures[f"{size}_rms_mm_new"] for size in ("apart", "skin", "shape")}
+    return figures | {f"{size}_over_new": ratio for size, ratio in over.items()}
 
 
-def session(setup: Setup, optics: Calibration, times: float, views: int, fringes: bool, k: int) -> Outcome:
-    """Draw the calibration's error, drift, skin and target, and correct."""
+def session(
+    setup: Setup,
+    optics: Calibration,
+    times: float,
+    views: int,
+    fringes: bool,
+    scale: float,
+    life: Literal["ideal", "lifelike"],
+    k: int,
+) -> Outcome:
+    """Draw the calibration's error, drift, skin and target, and correct; and draw the error of a new calibration."""
     rng = np.random.default_rng([SEED, k])
-    calibrated, usual = drift.calibration_uncertainty(optics, PRINT_SCALE), drift.usual_drift(optics.cameras, times * DRIFT_PX)
+    calibrated, usual = drift.calibration_uncertainty(optics, scale), drift.usual_drift(optics.cameras, times * DRIFT_PX)
     once = drawn_check.drawn_rig(optics.cameras, calibrated, rng)
     true = drawn_check.drawn_rig(once, usual, rng)
-    printed = conditions.printed(setup.rig.target, setup.conditions("lifelike").target, int(rng.integers(2**31)))
+    printed = conditions.printed(setup.rig.target, setup.conditions(life).target, int(rng.integers(2**31)))
     film = drawn_check.drawn_film(true, optics.cameras, printed, Noise().circle_px, rng, views) if views else None
     matches = drawn_check.drawn_matches(true, optics.cameras, COLUMNS, Noise().column_px, rng) if fringes else None
-    found = drift.estimate(optics, film, matches, setup.rig.target, PRINT_SCALE, DRIFT_PX)
+    found = drift.estimate(optics, film, matches, setup.rig.target, scale, DRIFT_PX)
     points = drawn_check.drawn_matches(true, true, COLUMNS, 1e-6, rng) if matches is None else matches
-    return _compared(found, true, points)
+    places = points_by_light(points.pixels, points.first, points.axes, true)
+    before, new = Calibration(optics.cameras, found.prior), drawn_check.drawn_rig(true, calibrated, rng)
+    errors = [_errors(each, true, places, rng) for each in (before, found.after, Calibration(new, calibrated))]
+    return Outcome(distance(found, true) < 1, (errors[0], errors[1], errors[2]), found.size, found.surprise)
 
 
-def _compared(found: Drift, true: Devices, matches: Matches) -> Outcome:
-    places = points_by_light(matches.pixels, matches.first, matches.axes, true)
-    apart, sigma, skin = [], [], []
-    for calibration in (Calibration(found.before.cameras, found.prior), found.after):
-        cameras = calibration.cameras
-        shown = true[PROJECTOR].project(places)[:, list(COLUMNS)]
-        by_light = points_by_light(true["cam1"].project(places), shown, COLUMNS, cameras)
-        apart.append(float(np.mean(drift.parting(cameras, true, places, COLUMNS)[:, 2])))
-        assert calibration.uncertainty is not None
-        slope = uncertainty.parting(calibration, places, COLUMNS)[:, 2].mean(axis=0)
-        sigma.append(float(np.sqrt(slope @ calibration.uncertainty.covariance @ slope)))
-        skin.append(float(np.sqrt(np.mean(np.sum((by_light - places) ** 2, axis=1)))))
-    inside = distance(found, true) < 1
-    return Outcome(inside, np.array(apart), np.array(sigma), np.array(skin), found.size, found.surprise)
+def _errors(calibration: Calibration, true: Devices, places: Array, rng: np.random.Generator) -> Errors:
+    """Errors of places : (n, 3) mm, which the true devices see."""
+    cameras, known = calibration.cameras, calibration.uncertainty
+    assert known is not None
+    shown = true[PROJECTOR].project(places)[:, list(COLUMNS)]
+    moved = points_by_light(true["cam1"].project(places), shown, COLUMNS, cameras) - places
+    slope = uncertainty.parting(calibration, places, COLUMNS)[:, 2].mean(axis=0)
+    modes = uncertainty.rigid_modes(places).reshape(-1, 6)
+    bent = moved.ravel() - modes @ np.linalg.lstsq(modes, moved.ravel())[0]
+    pairs = rng.integers(len(places), size=(len(places), 2))
+    way = np.diff(places[pairs], axis=1)[:, 0]
+    length = np.linalg.norm(way, axis=1)
+    some = (length > APART_MM[0]) & (length < APART_MM[1])
+    longer = np.linalg.norm(way + np.diff(moved[pairs], axis=1)[:, 0], axis=1)[some] - length[some]
+    return Errors(
+        apart_mm=float(np.mean(drift.parting(cameras, true, places, COLUMNS)[:, 2])),
+        sigma_mm=float(np.sqrt(slope @ known.covariance @ slope)),
+        skin_mm=_rms(np.linalg.norm(moved, axis=1)),
+        shape_mm=_rms(np.linalg.norm(bent.reshape(-1, 3), axis=1)),
+        distance_mm=_rms(longer),
+        distance_ppm=1e6 * _rms(longer / length[some]),
+    )
+
+
+def _rms(errors: Array) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def distance(found: Drift, true: Devices) -> float:
