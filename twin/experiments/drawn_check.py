@@ -21,6 +21,7 @@ from recon.model.calibration import Uncertainty, moved
 from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
+from recon.rig_check.ball_bar import BallBar
 from recon.rig_check.bottom_equations import Lines
 from recon.rig_check.fringe_matches import FLOOR_PX, HALF, MOST, SHARED
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
@@ -121,6 +122,22 @@ def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px
     sigma = np.full((len(pixels), 2, len(axes)), claimed)
     every = Matches(pixels, first, seen_at, second, gradient[:, list(axes)] / (2 * WINDOW_PX), sigma, axes)
     return every.some(chosen)
+
+
+def drawn_bar(true: Devices, centres_mm: Array, ball_mm: float, sigma_px: float, rng: np.random.Generator) -> BallBar:
+    """Points of two balls about centres : (2, 3) mm, as camera 1 and the fringes show them."""
+    camera, pixels, shown = true["cam1"], [], []
+    for centre in centres_mm:
+        middle, radius = camera.project(centre[None])[0], 0.7 * ball_mm / 2 * camera.matrix[0, 0] / centre[2]
+        disc = rng.uniform(-1, 1, (2000, 2))
+        seen = middle + radius * disc[np.hypot(*disc.T) < 1]
+        rays = camera.rays(seen)
+        along = rays @ (centre - camera.centre)
+        off = np.sum((centre - camera.centre) ** 2) - along**2
+        places = camera.centre + (along - np.sqrt((ball_mm / 2) ** 2 - off))[:, None] * rays
+        pixels.append(seen)
+        shown.append(true[PROJECTOR].project(places)[:, :1] + sigma_px * rng.standard_normal((len(seen), 1)))
+    return BallBar((pixels[0], pixels[1]), (shown[0], shown[1]), (0,))
 
 
 def _shown(true: Devices, name: str, pixels: Array) -> Array:

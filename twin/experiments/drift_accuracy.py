@@ -8,11 +8,14 @@ from scipy.stats import chi2
 
 from recon.estimation.parameters import of_block
 from recon.geometry.camera_jacobian import difference
+from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration
 from recon.optical_calibration import uncertainty
 from recon.rig_check import drift
+from recon.rig_check.ball_bar import Bars
 from recon.rig_check.drift import Drift
-from recon.rig_check.optics_equations import PROJECTOR, points_by_light
+from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, points_by_light
+from recon.tracking.pose_fit import meet
 from scenes.board_poses import Config as Poses
 from twin import conditions
 from twin.experiments import drawn_check, drawn_session
@@ -26,8 +29,24 @@ SEED = 3046
 VIEWS = 24  # of the target, as many as `sonotwin correct-optics` takes
 COLUMNS = (0,)  # axes of the fringes
 APART_MM = (50.0, 100.0)  # of two points of the skin whose distance is measured
+DEPTHS_MM = (620.0, 680.0)  # of the volume, whose scale is judged
+MICROSCOPE_MM = 0.002  # standard deviation of a target's lengths
+BAR_MM, BAR_SIGMA_MM, BALL_MM = 150.0, 0.002, 25.4  # distance of a bar's balls, its standard deviation, and their diameter
+BARS = np.array(  # (5, 2, 3) mm, ends of the bar: in the middle, near, far, upright, and tilted
+    [
+        [[-75.0, 0, 650], [75, 0, 650]],
+        [[-75.0, 0, 615], [75, 0, 615]],
+        [[-75.0, 0, 700], [75, 0, 700]],
+        [[0.0, -75, 690], [0, 75, 690]],
+        [[-60.0, 0, 605], [60, 0, 695]],
+    ]
+)
+PLACES = {"a ball bar in one place": 1, "a ball bar in five places": 5}
 KINDS = ("uncorrected", "corrected", "new")  # calibrations: as it was, corrected by the session, and made anew that day
 LEAST = 1e-9  # variance of a principal axis of the correlation, below which rounding decides
+
+
+KnownLength = Literal["the print", "a ball bar in one place", "a ball bar in five places", "a target under a microscope"]
 
 
 class Outcome(NamedTuple):
@@ -142,6 +161,40 @@ def _errors(calibration: Calibration, true: Devices, places: Array, rng: np.rand
 
 def _rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(errors**2)))
+
+
+def scales(setup: Setup, by: KnownLength, sessions: int = 100) -> Figures:
+    """Errors of the scale over sessions of drifted rigs, by fringes on the skin and a known length."""
+    optics = drawn_session.calibrated_optics(setup.rig, setup.conditions("lifelike"), Noise(), Poses(), SEED)
+    measured = setup.rig.target.model_copy(update={"tolerance_mm": MICROSCOPE_MM, "covariance_mm2": None})
+    found = []
+    for k in range(sessions):
+        rng = np.random.default_rng([SEED, 1, k])
+        once = drawn_check.drawn_rig(optics.cameras, drift.calibration_uncertainty(optics, PRINT_SCALE), rng)
+        true = drawn_check.drawn_rig(once, drift.usual_drift(optics.cameras, DRIFT_PX), rng)
+        matches = drawn_check.drawn_matches(true, optics.cameras, COLUMNS, Noise().column_px, rng)
+        film = bars = None
+        if by == "a target under a microscope":
+            errors = rng.multivariate_normal(np.zeros(len(measured.LENGTHS)), circle_layout.length_covariance(measured))
+            printed = circle_layout.with_lengths(measured, circle_layout.lengths(measured) + errors)
+            film = drawn_check.drawn_film(true, optics.cameras, printed, Noise().circle_px, rng, VIEWS)
+        if by in PLACES:
+            seen = (drawn_check.drawn_bar(true, ends, BALL_MM, Noise().column_px, rng) for ends in BARS[: PLACES[by]])
+            bars = Bars(tuple(seen), BAR_MM + BAR_SIGMA_MM * rng.standard_normal(), BAR_SIGMA_MM)
+        after = drift.estimate(optics, film, matches, measured, PRINT_SCALE, DRIFT_PX, bars).after
+        volume = uncertainty.working_volume(after, DEPTHS_MM)
+        pair = [cameras[name] for cameras in (after.cameras, true) for name in CAMERAS]
+        moved = meet(pair[:2], [camera.project(volume) for camera in pair[2:]])[0] - volume
+        modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
+        error = np.linalg.lstsq(modes.reshape(-1, 7), moved.ravel())[0][-1]
+        found.append((error, uncertainty.scale(after, *CAMERAS, volume)))
+    error, sigma = np.array(found).T
+    return {
+        "sessions": sessions,
+        "rms_ppm": 1e6 * _rms(error),
+        "sigma_ppm": 1e6 * float(np.median(sigma)),
+        "over_sigma": float(np.mean((error / sigma) ** 2)),
+    }
 
 
 def distance(found: Drift, true: Devices) -> float:

@@ -7,7 +7,7 @@ from recon.errors import InputError
 from recon.model.calibration import DRIFT_PX, moved
 from recon.optical_calibration import uncertainty
 from recon.rig_check import ball_bar, drift
-from recon.rig_check.ball_bar import BallBar, Bars
+from recon.rig_check.ball_bar import Bars
 from recon.rig_check.optics_equations import CAMERAS
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.phase import Noise
@@ -25,11 +25,11 @@ def calibration(rig):
     return calibration_of(rig)
 
 
-def depths(camera, pixels, centres=CENTRES):
+def depths(camera, pixels):
     """Points : (n, 3) mm of balls, and of the ground at 710 mm behind them, that a camera's pixels : (n, 2) see."""
     rays = camera.rays(pixels)
     far = (710 - camera.centre[2]) / rays[:, 2]
-    for centre in centres:
+    for centre in CENTRES:
         along = rays @ (centre - camera.centre)
         off = np.sum((centre - camera.centre) ** 2) - along**2
         with np.errstate(invalid="ignore"):
@@ -63,14 +63,7 @@ def drawn_map(cameras, rng):
 
 def drawn_bar(cameras, rng, moved_mm=(0.0, 0.0, 0.0)):
     """Points of both balls, as camera 1 and the projector see them."""
-    pixels, shown = [], []
-    for centre in CENTRES + moved_mm:
-        middle, radius = cameras["cam1"].project(centre[None])[0], 0.7 * BALL / 2 * cameras["cam1"].matrix[0, 0] / centre[2]
-        around = middle + radius * (disc := rng.uniform(-1, 1, (2000, 2)))[np.hypot(*disc.T) < 1]
-        places = depths(cameras["cam1"], around, CENTRES + moved_mm)
-        pixels.append(around)
-        shown.append(cameras["projector"].project(places)[:, :1] + SIGMA_PX * rng.standard_normal((len(around), 1)))
-    return BallBar(tuple(pixels), tuple(shown), (0,))
+    return drawn_check.drawn_bar(cameras, CENTRES + moved_mm, BALL, SIGMA_PX, rng)
 
 
 def test_two_balls_are_found_and_measured_to_their_noise(calibration, rng):
