@@ -30,6 +30,7 @@ from recon.structured_light.triangulate import PointMap, Triangulator
 
 BY = "surface"  # who writes
 POINTS, SKIN, GLB = "points.npz", "surface.ply", "surface.glb"
+FOREIGN = 0.001  # points through which one camera sees, over those that both measure: of right captures some in a million
 MOSTLY = 0.8  # share of the triangulated points, beyond which those that are removed make a warning
 
 
@@ -202,6 +203,7 @@ def beside(
         except InputError as fault:
             watch.say(f"compare     {name} isn't compared: {fault}")
             continue
+        watch.say(f"compare     {name}: {surface_figures.describe_unwrapping(its.patterns, other)}")
         alike = ray_checks.check_beside(found, raw, other, camera, shots.name, implausible)
         if np.isnan(alike):
             watch.say(f"compare     {name} isn't compared: both see too few points in common")
@@ -215,7 +217,10 @@ def describe_fusion(view: View, fused: Fused) -> str:
     name = view.camera.name
     if fused.shared.any():
         both, apart = (f"{np.count_nonzero(mask):,}".replace(",", " ") for mask in (fused.shared, fused.apart))
-        return f"fuse        {name} measures {both} points, too; {apart} left out, through which one of both sees"
+        line = f"{name} measures {both} points, too; {apart} left out, through which one of both sees"
+        if np.count_nonzero(fused.apart) <= FOREIGN * np.count_nonzero(fused.shared):
+            return f"fuse        {line}"
+        return f"warning     {line}: gloss, or a thing that came or went between both cameras' images?"
     if np.isnan(fused.bias_px):
         return f"fuse        {name} improves no point: both cameras see too few alike"
     cause = "devices that drifted, which sonotwin correct-optics corrects, or another calibration?"

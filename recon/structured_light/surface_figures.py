@@ -71,12 +71,17 @@ def describe_decoding(patterns: Patterns, found: ProjectorMap) -> Iterator[str]:
     saturated = 100 * found.summary["saturated"] / found.status.size
     yield f"decode      {patterns.count} images, {width}x{height}, modulation {strength:.0f} DN, {saturated:.1f} % saturated"
     yield from bent(found.linearity)
+    yield f"unwrap      {describe_unwrapping(patterns, found)}"
+
+
+def describe_unwrapping(patterns: Patterns, found: ProjectorMap) -> str:
+    """Way of unwrapping, and what it left out, in words."""
     notes = [str(patterns.unwrap).replace("_", " ")]
     if "regions" in found.summary:
         regions, islands = _counted(found.summary["regions"], "region"), _counted(found.summary["islands"], "island")
         notes.append(f"{regions}, {islands} left out ({found.summary['unreachable']} px)")
     notes.append(f"{found.summary['uncertain']} px uncertain")
-    yield f"unwrap      {', '.join(notes)}"
+    return ", ".join(notes)
 
 
 def bent(linearity: Linearity) -> Iterator[str]:
