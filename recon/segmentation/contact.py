@@ -51,7 +51,10 @@ LIMITS = ContactLimits()
 
 @dataclass(frozen=True)
 class Aside:
-    """Motion of the skin across the beam since the fringes, as distances along a sweep show it."""
+    """Motion of the skin across the beam since the fringes, as distances along a sweep show it.
+
+    Gel or pressure that changes over a second and more makes such a pattern, too, beyond what sigma has: it is no alarm.
+    """
 
     motion_mm: Array  # (3,) in the world
     sigma_mm: float  # standard deviation, in the direction that is known worst, of those that are known
@@ -124,7 +127,7 @@ class Contact:
             if self.aside.surprise > LIMITS.alarm_sigma:
                 place = ", ".join(f"{value:+.2f}" for value in self.aside.motion_mm)
                 moved = f"by {length:.2f} ± {sigma:.2f} mm ({place}), {self.aside.surprise:.1f} sigma"
-                told.append(f"warning     contact: varies along the sweep as if the skin had moved aside {moved}: {UNEVEN}?")
+                told.append(f"aside       contact varies along the sweep as if the skin had moved aside {moved}: {UNEVEN}?")
             else:
                 told.append(f"aside       the skin stayed, as far as contact shows: it moved by {length:.2f} ± {sigma:.2f} mm")
         return told

@@ -134,7 +134,7 @@ def test_a_skin_that_moved_aside_shows_along_a_dome(rng, motion_mm):
     assert abs(found.median_mm) < 0.15
     assert found.aside is not None and found.aside.surprise > contact.LIMITS.alarm_sigma
     assert np.linalg.norm(found.aside.motion_mm - motion_mm) < 3 * found.aside.sigma_mm < 0.8
-    assert any(line.startswith("warning") and "moved aside" in line for line in found.lines)
+    assert any(line.startswith("aside") and "as if the skin had moved aside" in line for line in found.lines)
 
 
 def test_a_skin_that_stayed_seldom_moves_aside(rng):

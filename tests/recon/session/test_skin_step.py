@@ -18,6 +18,7 @@ def test_a_thing_that_one_camera_alone_saw_is_said(apart, start):
     nothing = PointMap(np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32))
     camera = Camera((1300, 1000), np.diag([3000.0, 3000, 1]), np.zeros(5), np.eye(4), name="cam2")
     found = ProjectorMap.__new__(ProjectorMap)  # of which nothing is said here
-    line = skin_step.describe_fusion(View(camera, found, nothing), Fused(nothing, nothing, shared & ~gone, gone, 0.0))
+    fused = Fused(nothing, nothing, shared & ~gone, gone, np.zeros((1, 1), np.int64), 0.0)
+    line = skin_step.describe_fusion(View(camera, found, nothing), fused)
     assert line.startswith(start) and f"{apart:,}".replace(",", " ") in line
     assert ("came or went" in line) == (start == "warning")
