@@ -171,6 +171,9 @@ def check(sources: Sources) -> None:
         probe_files.read(settings.probe)
     for bar in settings.bars:
         manifest.read_manifest(bar)
+    if settings.board_row_mm is not None and (settings.calibration is not None or held.board is None):
+        found = "none in the capture" if held.board is None else "a calibration that is given instead"
+        raise InputError(f"board_row_mm: expected beside a board that the optics are calibrated by, found {found}")
     if settings.networks is not None and not settings.networks.exists():
         raise InputError(f"networks: expected a folder or a file, found nothing at {settings.networks}")
     path = settings.capture / MANIFEST
@@ -189,7 +192,7 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
     settings, held = sources.settings, sources.held
     own = None if held.calibration is None else settings.capture / held.calibration
     if settings.calibration is not None:
-        return steps.take("optics", settings.calibration, "as given")
+        return steps.take("optics", settings.calibration, "as given" if held.board is None else "as given; the board isn't used")
     if held.board is None:
         return None if own is None else steps.take("optics", own, "the capture's own, as it has no board")
     if held.board.patterns is None and held.surface is not None and own is not None:
