@@ -112,7 +112,8 @@ def write(path: Path, calibration: Calibration) -> None:
         storage.endWriteStruct()
     if calibration.uncertainty is not None:
         opencv_storage.write_covariance(storage, calibration.uncertainty.names, calibration.uncertainty.covariance)
-        storage.write(own.HAS_SCALE, int(calibration.uncertainty.has_scale))
+        if calibration.uncertainty.has_scale:
+            storage.write(own.HAS_SCALE, 1)
     opencv_storage.save(path, storage)
 
 

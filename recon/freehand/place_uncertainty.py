@@ -23,7 +23,6 @@ from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 Array = NDArray[np.float64]
 
 COLUMNS = (3, 0, 1)  # of a matrix from pixels: the origin, u, v
-GIVEN_MM = 0.05  # standard deviation by which a bracket gives between wires and sweep; assumed: a printed one, pressed
 
 
 @dataclass(frozen=True)
@@ -117,53 +116,34 @@ def mean_sigma(
     pixels: Array,
     directions: Array,
 ) -> float:
-    """Standard deviation, mm, of the mean displacement of a pixel in each of some B-scans, against what light measures.
+    """Standard deviation, mm, of the mean displacement of a pixel in each of some B-scans.
 
-    Parameters as of `covariance_of_sums`. By how much the bracket gives is in it, too.
-    """
-    mean = np.full((1, len(used)), 1 / len(used))
-    return float(
-        np.hypot(GIVEN_MM, np.sqrt(covariance_of_sums(world_from_pixel, probe, errors, used, pixels, directions, mean)[0, 0]))
-    )
-
-
-def covariance_of_sums(
-    world_from_pixel: Array,
-    probe: ProbeCalibration,
-    errors: PlaceErrors | None,
-    used: NDArray[np.intp],
-    pixels: Array,
-    directions: Array,
-    weights: Array,
-) -> Array:
-    """Covariance : (k, k) mm^2 of weighted sums of the displacements of a pixel in each of some B-scans, against light's.
-
-    What errs alike in both isn't in it: the frame of the optics, and the target's print, which the probe's calibration has in it.
+    What errs alike in places by light isn't in it: the frame of the optics, and the target's print, which the probe's calibration
+    has in it. Nor is what parts light from both cameras.
 
     Parameters
     ----------
     world_from_pixel, errors : of all n B-scans
     used : (m,) numbers of those that count
     pixels, directions : (m, 2) u, v in each of these, and unit vectors : (m, 3) along which displacements count
-    weights : (k, m)
     """
     terms = np.column_stack([np.ones(len(pixels)), pixels])
 
     def along(slopes: Array) -> Array:
-        """Derivatives : (m, j) of the displacements, from slopes : (m, 3, 3, j) of places."""
+        """Derivatives : (m, k) of the displacements, from slopes : (m, 3, 3, k) of places."""
         return np.einsum("nt,ntik,ni->nk", terms, slopes, directions)
 
-    world, covariance = world_from_pixel[used], np.zeros(2 * (len(weights),))
+    world, variance = world_from_pixel[used], 0.0
     if probe.uncertainty is not None:
-        covariance = propagate(weights @ along(probe_slopes(world, probe)), probe.uncertainty.ordered(NAMES))
+        by_probe = along(probe_slopes(world, probe)).mean(axis=0)
+        variance += float(propagate(by_probe[None], probe.uncertainty.ordered(NAMES))[0, 0])
     if errors is not None:
-        by_lag = errors.lag_s * weights @ along(rate_slopes(errors.rates[used]))
-        by_depth = errors.depth * weights @ along(depth_slopes(world, probe.face_row))
-        by_pose = along(pose_slopes(world, probe))
-        by_each = np.stack([errors.shares[used].T @ (row[:, None] * by_pose) for row in weights])
-        covariance = covariance + by_lag @ by_lag.T + by_depth @ by_depth.T
-        covariance = covariance + np.einsum("kma,mab,lmb->kl", by_each, errors.poses, by_each)
-    return covariance
+        by_lag = along(rate_slopes(errors.rates[used])).mean(axis=0)
+        by_depth = along(depth_slopes(world, probe.face_row)).mean(axis=0)
+        by_each = errors.shares[used].T @ along(pose_slopes(world, probe)) / len(used)
+        variance += float(errors.lag_s**2 * by_lag @ by_lag + errors.depth**2 * by_depth @ by_depth)
+        variance += float(np.einsum("mk,mkl,ml->", by_each, errors.poses, by_each))
+    return float(np.sqrt(variance))
 
 
 def sigma_volume(

@@ -257,7 +257,7 @@ def _millimetre_maps(found: Calibration, metrics: Metrics, depths: Sequence[floa
             f"Over the image of {first}, for points measured with {first} and {second}, without the noise of that measurement. "
             f"Lengths share an uncertainty of scale of {shown(metrics['scale_sigma_ppm'], '.0f')} ppm, that of the board’s print "
             "(board_scale) included: a board printed 0.1 % too large makes everything 0.1 % too small. Known lengths make it "
-            "less: a caliper over its longest row (board_row_mm), a ball bar, a target under a microscope, a board on glass."
+            "less: a caliper over the board (board_length_mm), a ball bar, a target under a microscope, a board on glass."
         )
     )
     return blocks

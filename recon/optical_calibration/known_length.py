@@ -27,41 +27,44 @@ WAYS = (  # to a scale that is better known, the cheapest first: relative standa
 )
 
 
-def with_length(result: Result, scale: float | None, row_mm: tuple[float, float] | None, name: str) -> tuple[Result, float]:
+def with_length(result: Result, scale: float | None, length_mm: tuple[float, float] | None, name: str) -> tuple[Result, float]:
     """A calibration whose scale is as well known as the board's; returns it, and by what ratio lengths have grown.
 
     Parameters
     ----------
     scale : relative standard deviation of the board's print, as of `recon.model.calibration.with_scale`
-    row_mm : distance of the first from the last point of the board's longest row, and its standard deviation; None without
+    length_mm : of the board's longest line of points, as of `longest`, and its standard deviation; None without
 
     Raises
     ------
     InputError
-        If the length is none of this board.
+        If the length is none of this board, or can't tell the scale.
     """
     adjusted = result.adjustment
-    made, cameras, inferred = adjusted.calibration, adjusted.calibration.cameras, 0.0
+    made, cameras = adjusted.calibration, adjusted.calibration.cameras
     assert made.uncertainty is not None
-    known = made.uncertainty
-    if result.released:
-        inferred = result.tolerances.scale_sigma(result.observations.points)
+    known, inferred = made.uncertainty, result.tolerances.scale_sigma(result.observations.points) if result.released else 0.0
     prior, step = max(inferred, PRINT_SCALE if scale is None else scale), 0.0
-    if row_mm is not None:
-        length, sigma = row_mm
-        found = row_length(adjusted.points, result.observations.points)
+    if length_mm is not None:
+        if len(cameras) == 1 or not result.released or prior == 0:
+            lacking = (
+                "two devices" if len(cameras) == 1 else "a board_scale above 0" if prior == 0 else "a board whose shape is found"
+            )
+            way = "; a board as designed, or of few poses, has its lengths in its description" if not result.released else ""
+            raise InputError(f"{name}: board_length_mm: expected {lacking} beside it, found none{way}")
+        length, sigma = length_mm
+        found = length_of(adjusted.points, longest(result.observations.points))
         larger, noise = length / found - 1, sigma / found
         usual = float(np.hypot(prior, noise))
         if abs(larger) > BEYOND * usual:
             expected = (
                 f"expected {found:.3f} mm within {BEYOND * usual * found:.3f}, by the board's description, found {length:g}"
             )
-            cause = "another board, or a row from edge to edge? board_scale=... is of a worse print"
-            raise InputError(f"{name}: board_row_mm: {expected}: {cause}")
+            cause = "another board or line of points, or from edge to edge? board_scale=... is of a worse print"
+            raise InputError(f"{name}: board_length_mm: {expected}: {cause}")
         step, prior = larger * (prior / usual) ** 2, prior * noise / usual
-        if result.released:
-            direction = scale_errors(adjusted.problem, adjusted.estimate) / max(inferred, 1e-12)
-            known = replace(known, covariance=known.covariance + (prior**2 - inferred**2) * np.outer(direction, direction))
+        direction = scale_errors(adjusted.problem, adjusted.estimate) / max(inferred, 1e-12)
+        known = replace(known, covariance=known.covariance + (prior**2 - inferred**2) * np.outer(direction, direction))
         cameras = {device: _larger(camera, step) for device, camera in cameras.items()}
         poses = adjusted.poses.copy()
         poses[:, :3, 3] *= 1 + step
@@ -70,23 +73,35 @@ def with_length(result: Result, scale: float | None, row_mm: tuple[float, float]
     return replace(result, adjustment=replace(adjusted, calibration=replace(made, cameras=cameras, uncertainty=known))), step
 
 
-def row_length(points: Array, design: Array) -> float:
-    """Distance, mm, of the first from the last point of a board's longest row, by its points : (n, 3) mm and their design."""
-    _, rows = np.unique(np.round(design[:, 1], 3), return_inverse=True)
-    lengths = [np.ptp(design[rows == row, 0]) for row in range(rows.max() + 1)]
-    longest = np.flatnonzero(rows == int(np.argmax(lengths)))
-    first, last = longest[[np.argmin(design[longest, 0]), np.argmax(design[longest, 0])]]
-    return float(np.linalg.norm(points[last] - points[first]))
+def longest(design: Array) -> tuple[int, int]:
+    """Numbers of the first and the last point of the longest row or column of a board : (n, 3) mm."""
+    ends, length = (0, 0), -1.0
+    for along, across in ((0, 1), (1, 0)):
+        _, lines = np.unique(np.round(design[:, across], 3), return_inverse=True)
+        for line in range(lines.max() + 1):
+            own = np.flatnonzero(lines == line)
+            places = design[own, along]
+            if np.ptp(places) > length:
+                ends, length = (int(own[places.argmin()]), int(own[places.argmax()])), float(np.ptp(places))
+    return ends
 
 
-def describe(sigma: float, row_mm: float | None = None) -> str:
+def length_of(points: Array, ends: tuple[int, int]) -> float:
+    """Distance, mm, of two of points : (n, 3) mm by their numbers."""
+    return float(np.linalg.norm(points[ends[1]] - points[ends[0]]))
+
+
+def describe(sigma: float, length_mm: float | None = None) -> str:
     """A line: the relative standard deviation of the scale, and the cheapest way to half of it.
 
-    row_mm : of the board that a caliper may measure
+    length_mm : of the board's longest line of points, that a caliper may measure
     """
     ways = WAYS
-    if row_mm is not None:
-        ways = ((f"a caliper over the board's longest row of {row_mm:.0f} mm (board_row_mm)", CALIPER_MM / row_mm), *WAYS)
+    if length_mm is not None:
+        ways = (
+            (f"a caliper over the board's longest line of {length_mm:.0f} mm (board_length_mm)", CALIPER_MM / length_mm),
+            *WAYS,
+        )
     better = (f"; {way} would make it {1e6 * reached:.0f}" for way, reached in ways if reached <= sigma / 2)
     return f"scale       known to {1e6 * sigma:.0f} ppm{next(better, '')}"
 

@@ -118,7 +118,7 @@ def shape(
 
 
 def scale(
-    calibration: Calibration, first: str, second: str, volume: Array, pixel_sigma: tuple[float, float] = (1.0, 1.0)
+    calibration: Calibration, first: str, second: str, volume: Array, pixel_sigma: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)
 ) -> float:
     """Standard deviation of the scale of lengths in a volume : (k, 3) mm, as a ratio: 1e-4 is 0.1 mm in 1 m."""
     modes = np.concatenate([rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)

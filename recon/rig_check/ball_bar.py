@@ -5,6 +5,7 @@ for one place. Spheres of free radius are fitted, since paint makes balls larger
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from recon.errors import InputError
 from recon.estimation.covariance import whitening
 from recon.geometry.camera import Camera
 from recon.geometry.primitives import Fit, Sphere, fit_sphere
-from recon.model.calibration import linearise
+from recon.model.calibration import Calibration, linearise
 from recon.rig_check.fringe_matches import SHARED
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, DeviceRows, points_by_light
 from recon.structured_light.decode import ProjectorMap
@@ -25,17 +26,21 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Limits(NamedTuple):
+@dataclass(frozen=True)
+class Limits:
     """When points are a ball's."""
 
-    window: float = 0.15  # of a ball's radius: half the side of the windows, in which normals are measured
-    vote: float = 0.1  # of the radius: side of the cells in which votes are counted
+    window: float = 0.15  # of a ball's radius: half the side of the windows, in which normals are measured; they bend by 9 deg
+    vote: float = 0.1  # of the radius: side of the cells in which votes are counted, as far as normals err by noise
     near: float = 0.1  # of the radius: distance from a ball's surface, within which points are its
-    facing: float = 0.6  # cosine of the angle from the line of sight, below which a ball's rim is left out
-    round: float = 0.05  # relative, by which a diameter may differ from that given
-    least: int = 300  # points of a ball
+    facing: float = (
+        0.6  # cosine of the angle from the line of sight, below which a ball's rim is left out: fringes thin out there
+    )
+    roundness: float = 0.05  # relative, by which a diameter may differ from that given
+    least: int = 300  # points of a ball: fewer than of one of 20 px across
     most: int = 20_000  # of these that are fitted
     slopes: int = 500  # of these by which slopes are taken
+    alarm_sigma: float = 5.0  # of what calibration and usual drift leave, from which on a length isn't this bar's
 
 
 LIMITS = Limits()
@@ -98,7 +103,7 @@ def find(
         if sphere is not None:
             diameters.append(2 * sphere.radius)
             votes = votes[np.linalg.norm(votes - sphere.centre, axis=1) > radius]
-        if sphere is None or abs(2 * sphere.radius / ball_mm - 1) > limits.round:
+        if sphere is None or abs(2 * sphere.radius / ball_mm - 1) > limits.roundness:
             sizes = ", ".join(f"{diameter:.2f} mm" for diameter in diameters) or "none"
             raise InputError(
                 f"{name}: expected two balls of {ball_mm:g} mm before {CAMERAS[0]} and {PROJECTOR}, found {sizes}: is ball_mm "
@@ -125,6 +130,15 @@ def measure(bar: BallBar, cameras: Mapping[str, Camera], names: Sequence[str], l
     return Measured(length, float(np.sqrt(variance)), along @ (slopes[1] - slopes[0]), balls)
 
 
+def departure(bars: Bars, calibration: Calibration) -> Array:
+    """Measured less certified lengths : (n,), in standard deviations of what the calibration's uncertainty and noise leave."""
+    known = calibration.uncertainty
+    assert known is not None
+    found = [measure(bar, calibration.cameras, known.names) for bar in bars.seen]
+    variances = [one.by_optics @ known.covariance @ one.by_optics + one.sigma_mm**2 + bars.sigma_mm**2 for one in found]
+    return (np.array([one.length_mm for one in found]) - bars.length_mm) / np.sqrt(variances)
+
+
 def equations(bars: Bars, cameras: Mapping[str, Camera], names: Sequence[str], lengths: int) -> DeviceRows:
     """Equations of the bar's length in all places, of variance 1, beside `lengths` of a target that they say nothing of.
 
@@ -140,6 +154,8 @@ def equations(bars: Bars, cameras: Mapping[str, Camera], names: Sequence[str], l
 def _votes(grid: Array, camera: Camera, radius: float, limits: Limits) -> Array:
     """Centres : (m, 3) mm of balls of a radius on which points : (h, w, 3) mm would lie, by their normals."""
     known = np.isfinite(grid).all(axis=-1)
+    if not known.any():
+        return np.zeros((0, 3))
     distance = float(np.median(np.linalg.norm(grid[known] - camera.centre, axis=1)))
     half = max(1, round(limits.window * radius * camera.matrix[0, 0] / distance))
     smooth = ndimage.uniform_filter(np.where(known[..., None], grid, 0.0), (half, half, 0))

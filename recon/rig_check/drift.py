@@ -128,6 +128,13 @@ def estimate(
     return Drift(calibration, before, after, size, seen.surprise(priors[1.0]))
 
 
+def expected(calibration: Calibration, scale: float | None, drift_px: float) -> Uncertainty:
+    """Uncertainty of a calibration after usual drift; parameters as of `estimate`."""
+    made, usual = calibration_uncertainty(calibration, scale), usual_drift(calibration.cameras, drift_px)
+    names = (*made.names, *(name for name in usual.names if name not in made.names))
+    return Uncertainty(names, made.ordered(names) + usual.ordered(names), has_scale=True)
+
+
 def parting(known: Mapping[str, Camera], true: Mapping[str, Camera], points: Array, axes: Sequence[int]) -> Array:
     """Displacement : (n, 3) mm of points : (n, 3) mm by light against the same by both cameras.
 

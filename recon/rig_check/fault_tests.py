@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 RIVAL = np.log(20.0)  # of evidence, below the best one's: another part that may be it
 UNSEEN = 1e-6  # of the largest eigenvalue: a direction of motion that measurements don't show
 SMALLEST = -600.0  # logarithm of a chance, below which numbers have no digits left
-MANY = 200  # degrees of freedom, that show noise to 5 %: it is taken as found where it is smaller than predicted, too
-LEAST = 0.1  # of the predicted noise: less is rounding
+WORTH = 200  # degrees of freedom that a prediction of the noise is worth, where noise is smaller than predicted
 MOST_NAMED = 3  # parts: beyond, all is to be calibrated anew anyway
 
 
@@ -71,14 +70,15 @@ def unexplained(equations: Equations, used: NDArray[np.bool_]) -> Array:
 def noise_factor(equations: Equations) -> float:
     """Standard deviation of the residuals that no error and no motion explains, over the predicted one.
 
-    At least 1 where few equations show it.
+    Where it is smaller, the prediction counts as so many equations more (a conjugate prior).
     """
     explained = _scaled(equations)
     freedom = len(explained) - int(np.linalg.matrix_rank(explained, rtol=UNSEEN))
     if freedom < 1:
         return 1.0
     left = unexplained(equations, np.ones(len(explained), bool))
-    return max(float(np.sqrt(left @ left / freedom)), LEAST if freedom >= MANY else 1.0)
+    found = float(left @ left)
+    return float(np.sqrt(found / freedom if found > freedom else (found + WORTH) / (freedom + WORTH)))
 
 
 def _scaled(equations: Equations) -> Array:
@@ -140,9 +140,9 @@ def _weighed(equations: Equations, slopes: Array) -> Array:
 
 
 def best_chance(equations: Equations, part: str, motion: Array, alarm_sigma: float) -> float:
-    """Chance at which a motion : (k,) is found by a test that knows it but for its sign and size; no test finds it more often.
+    """Chance at which a motion : (k,) is found by a test that knows its direction: no unbiased test finds it more often.
 
-    Source: Neyman & Pearson 1933.
+    Source: Neyman & Pearson 1936, of tests unbiased to both sides.
     """
     effect = equations.faults[part].slopes @ motion
     sigma = float(np.sqrt(effect @ _weighed(equations, effect[:, None])[:, 0]))

@@ -161,7 +161,10 @@ def covered(inner: Segmented, cover: Cover, ends: Array, sigma_mm: float) -> Seg
 
 
 def _wall_sigma(scans: Scans, tube: Tube, rings: Sequence[Ring]) -> float:
-    """Standard deviation, mm, of the place of a tube's wall towards the camera; NaN where the calibration's isn't known."""
+    """Standard deviation, mm, of the place of a tube's wall towards the camera; NaN where the calibration's isn't known.
+
+    Noise of the fit is at most that of the radius. A drift that parts the surface by light from the tube isn't in it.
+    """
     if scans.probe is None or scans.probe.uncertainty is None:
         return np.nan
     used, up = np.unique(tube.frames), tube_cover.to_camera(tube.shape)

@@ -98,7 +98,8 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     given = (settings.calibration, settings.target, settings.networks, *settings.bars)
     atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     held = manifest.read_manifest(settings.capture)
-    calibration = calibration_files.read_for(held.calibration_file(settings.capture, settings.calibration), sizes(held))
+    file = held.calibration_file(settings.capture, settings.calibration)
+    calibration = calibration_files.read_for(file, sizes(held))
     if calibration.uncertainty is None:
         watch.say("warning     no covariance in the calibration: its errors count as drift, and what is left of both isn't known")
     matches = match_fringes(settings.capture, settings.calibration, held, calibration, watch)
@@ -106,7 +107,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     if matches is None and not film:
         expected = f"fringes before {' and '.join(CAMERAS)}, or frames in which both see the target"
         raise InputError(f"{settings.capture / MANIFEST}: expected {expected}, found neither")
-    bars = find_bars(settings, calibration, watch)
+    bars = find_bars(settings, file, calibration, watch)
     with watch.busy("estimating the drift"):
         found = correct(calibration, matches, film, target_of(settings), settings, bars)
     if not found.is_drift:
@@ -137,27 +138,38 @@ def correct(
     return Corrected(found, matches, len(film), measure(found, matches, film))
 
 
-def find_bars(settings: Settings, calibration: Calibration, watch: Watch) -> Bars | None:
+def find_bars(settings: Settings, file: Path, calibration: Calibration, watch: Watch) -> Bars | None:
     """The ball bar in each of the settings' captures; says its length by the calibration as it was. None without.
+
+    file : of the calibration
 
     Raises
     ------
     InputError
-        If images are missing or damaged, can't be decoded, or show no two balls.
+        If images are missing or damaged, can't be decoded, show no two balls, or a bar of another length.
     """
     if settings.bar_mm is None:
         return None
+    length_mm, sigma_mm = settings.bar_mm
+    used = replace(calibration, uncertainty=drift.expected(calibration, settings.board_scale, settings.drift_px))
     seen = []
     for capture in settings.bars:
-        shots = surface_part.read_surface(capture, CAMERAS[0], settings.calibration)
+        shots = surface_part.read_surface(capture, CAMERAS[0], file)
         found = decode.decode(
             shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {CAMERAS[0]}", camera=CAMERAS[0]
         )
         seen.append(ball_bar.find(found, calibration.cameras, settings.ball_mm, str(capture)))
         by_light = ball_bar.measure(seen[-1], calibration.cameras, ())
         balls = " and ".join(f"{ball:.2f}" for ball in by_light.balls_mm)
-        watch.say(f"bar         {by_light.length_mm:.3f} mm of {settings.bar_mm[0]:g}, balls of {balls} mm")
-    return Bars(tuple(seen), *settings.bar_mm)
+        off = float(ball_bar.departure(Bars((seen[-1],), length_mm, sigma_mm), used)[0])
+        length = f"{by_light.length_mm:.3f} mm of {length_mm:g}, {off:+.1f} sigma of calibration and usual drift"
+        if abs(off) > ball_bar.LIMITS.alarm_sigma:
+            cause = "another bar, another distance of its balls, or devices that were pushed? board_scale=... is of a worse print"
+            raise InputError(
+                f"{capture}: bar_mm: expected a bar's length by calibration and usual drift, found {length}: {cause}"
+            )
+        watch.say(f"bar         {length}; balls of {balls} mm")
+    return Bars(tuple(seen), length_mm, sigma_mm)
 
 
 def with_open_scale(target: Target) -> Target:
@@ -228,16 +240,16 @@ def measure(found: Drift, matches: Matches | None, film: Sequence[tuple[Sighting
     if matches is None:
         both = [[view.camera for view in pair] for pair in film]
         places = [meet(cameras, [view.centres for view in pair])[0] for cameras, pair in zip(both, film, strict=True)]
-        measured_by, volume = CAMERAS[1], np.concatenate(places)
+        measured_by, volume, decoded = CAMERAS[1], np.concatenate(places), np.ones(2)
     else:
-        measured_by = PROJECTOR
+        measured_by, decoded = PROJECTOR, np.where(np.isin([0, 1], matches.axes), 1.0, np.inf)
         volume = points_by_light(matches.pixels, matches.first, matches.axes[:1], found.after.cameras)
     figures: Metrics = {
         "matches": 0 if matches is None else len(matches.pixels),
         "views": len(film),
         "size": found.size,
         "surprise_sigma": found.surprise,
-        "scale_sigma_ppm": 1e6 * uncertainty.scale(found.after, CAMERAS[0], measured_by, volume),
+        "scale_sigma_ppm": 1e6 * uncertainty.scale(found.after, CAMERAS[0], measured_by, volume, (1.0, decoded)),
     }
     for name, (change, sigma) in changes(found).items():
         figures |= {f"{name.replace('.', '_')}_change": change, f"{name.replace('.', '_')}_sigma": sigma}
@@ -286,7 +298,7 @@ def describe(found: Corrected) -> Iterator[str]:
     if "skin_moved_mm" in found.figures:
         moved, before, left = (found.figures[f"skin_{name}_mm"] for name in ("moved", "sigma_before", "sigma"))
         yield f"apart       skin from target by {moved:.3f} mm uncorrected (1 sigma {before:.3f}), and now 1 sigma {left:.3f} mm"
-    yield known_length.describe(1e-6 * float(found.figures["scale_sigma_ppm"] or 0))
+    yield known_length.describe(1e-6 * float(found.figures["scale_sigma_ppm"]))
 
 
 def write_page(found: Corrected, name: str) -> str:

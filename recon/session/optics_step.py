@@ -7,7 +7,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
-from recon import linear_algebra
 from recon.capture import board_part, calibration_files, manifest
 from recon.capture.board_part import BoardCapture
 from recon.capture.layouts import meza2021
@@ -22,7 +21,7 @@ from recon.optical_calibration.joint_calibration import Result
 from recon.optical_calibration.observations import PROJECTOR
 from recon.optical_calibration.sightings import Cause, Failure, light
 from recon.pattern_trials import likely_patterns
-from recon.session.settings import BoardField, BoardRowField
+from recon.session.settings import BoardField, BoardLengthField
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import surface_figures
 
@@ -40,7 +39,7 @@ CONTENTS = {
 }
 
 
-class Settings(BoardRowField, BoardField, joint_calibration.Settings):
+class Settings(BoardLengthField, BoardField, joint_calibration.Settings):
     """Sources, and settings of the calibration."""
 
     capture: Path
@@ -78,20 +77,19 @@ def run(settings: Settings, out: Path, command: str, watch: Watch = SILENT) -> N
     captured = board_part.read_board(settings.capture)
     sizes = board_frames.sizes_of(captured, settings.devices)
     truth = None if settings.truth is None else calibration_files.read_for(settings.truth / manifest.OPTICS, sizes)
-    found = calibrate(captured, settings, settings.devices, truth, watch, settings.board_scale, settings.board_row_mm)
+    found = calibrate(captured, settings, settings.devices, truth, watch, settings.board_scale, settings.board_length_mm)
     names = write(out, found, command, truth)
     watch.say(f"wrote       {out}/{{{','.join(names)}}}")
 
 
-@linear_algebra.on_one_thread()
 def calibrate(
     captured: BoardCapture,
     settings: joint_calibration.Settings | None = None,
     devices: tuple[DeviceName, ...] | None = None,
     truth: Calibration | None = None,
     watch: Watch = SILENT,
-    board_scale: float | None = 0.0,
-    board_row_mm: tuple[float, float] | None = None,
+    board_scale: float | None = None,
+    board_length_mm: tuple[float, float] | None = None,
 ) -> Optics:
     """Calibrate cameras and projector, all at once, by a board in many poses.
 
@@ -101,7 +99,7 @@ def calibrate(
     truth : of a rendered capture, for the figures alone
     board_scale : relative standard deviation of the print's scale, which no image shows; 0 leaves what its shape says of it, None
         is that of paper
-    board_row_mm : length of its longest row as measured, and its standard deviation, which give the scale
+    board_length_mm : of its longest row or column as measured, and its standard deviation, which give the scale
 
     Raises
     ------
@@ -135,9 +133,9 @@ def calibrate(
             result, warnings=(f"{PROJECTOR}: the code leaves its image in {beyond} poses; {cause}", *result.warnings)
         )
     seconds["seconds_adjust"] = round(perf_counter() - start, 3)
-    result, larger = known_length.with_length(result, board_scale, board_row_mm, captured.name)
+    result, larger = known_length.with_length(result, board_scale, board_length_mm, captured.name)
     figures = figures_of_merit.measure(result, truth)
-    if board_row_mm is not None:
+    if board_length_mm is not None:
         figures["scale_change_ppm"] = 1e6 * larger
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
     for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
@@ -184,9 +182,11 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
         yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
         if "scale_change_ppm" in figures:
-            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by the board's longest row, in place of its description"
-        row_mm = known_length.row_length(result.adjustment.points, result.observations.points)
-        yield known_length.describe(1e-6 * float(figures["scale_sigma_ppm"] or 0), row_mm)
+            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by a length of the board, in place of its description"
+        ends = known_length.longest(result.observations.points)
+        yield known_length.describe(
+            1e-6 * float(figures["scale_sigma_ppm"]), known_length.length_of(result.adjustment.points, ends)
+        )
     else:
         seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
         yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"

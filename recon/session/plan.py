@@ -1,6 +1,6 @@
 """The experiment: the steps that a capture allows, in their order, each in a folder of its own, and why one is left out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,7 +31,7 @@ from recon.session import (
     store,
     volume_step,
 )
-from recon.session.settings import BarFields, BoardRowField, EchoFields, ScaleFields, Spacing, TargetField
+from recon.session.settings import BarFields, BoardLengthField, EchoFields, ScaleFields, Spacing, TargetField
 from recon.session.store import Store, files_of
 from recon.session.tracker_settings import TrackingFields
 from recon.session.watch import SILENT, Watch
@@ -45,7 +45,7 @@ WITHIN = 0.2  # of usual drift, that devices drift within a session: fringes and
 Command = Callable[[optics_step.Settings, Path], str]
 
 
-class Settings(EchoFields, TissueFields, TargetField, BoardRowField, BarFields, TrackingFields, ScaleFields):
+class Settings(EchoFields, TissueFields, TargetField, BoardLengthField, BarFields, TrackingFields, ScaleFields):
     """Source, and what is known beforehand."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -171,9 +171,9 @@ def check(sources: Sources) -> None:
         probe_files.read(settings.probe)
     for bar in settings.bars:
         manifest.read_manifest(bar)
-    if settings.board_row_mm is not None and (settings.calibration is not None or held.board is None):
-        found = "none in the capture" if held.board is None else "a calibration that is given instead"
-        raise InputError(f"board_row_mm: expected beside a board that the optics are calibrated by, found {found}")
+    if settings.board_length_mm is not None and not is_by_board(sources):
+        found = "none in the capture" if held.board is None else "another calibration in its place"
+        raise InputError(f"board_length_mm: expected beside a board that the optics are calibrated by, found {found}")
     if settings.networks is not None and not settings.networks.exists():
         raise InputError(f"networks: expected a folder or a file, found nothing at {settings.networks}")
     path = settings.capture / MANIFEST
@@ -187,6 +187,13 @@ def check(sources: Sources) -> None:
         sound_in_water.speed_of_sound(settings.temperature_c)
 
 
+def is_by_board(sources: Sources) -> bool:
+    """Whether the optics are calibrated by the capture's board, not as given, or as the capture has them for its fringes."""
+    held = sources.held
+    lit = held.board is None or held.board.patterns is not None
+    return sources.settings.calibration is None and held.board is not None and (lit or not (held.surface and held.calibration))
+
+
 def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
     """Calibrate cameras and projector by the board, or take the calibration given, or the capture's own; returns its file."""
     settings, held = sources.settings, sources.held
@@ -195,14 +202,14 @@ def calibrate_optics(steps: Store, sources: Sources) -> Path | None:
         return steps.take("optics", settings.calibration, "as given" if held.board is None else "as given; the board isn't used")
     if held.board is None:
         return None if own is None else steps.take("optics", own, "the capture's own, as it has no board")
-    if held.board.patterns is None and held.surface is not None and own is not None:
+    if not is_by_board(sources):
         steps.leave_out("optics", f"the board was seen without fringes, and so not by the projector; {own} is used")
         return own
 
     def work(by_board: optics_step.Settings, out: Path) -> None:
         optics_step.run(by_board, out, sources.command(by_board, out), sources.watch)
 
-    does, same = "cameras and projector, from the board", ("capture", "board_scale", "board_row_mm")
+    does, same = "cameras and projector, from the board", ("capture", "board_scale", "board_length_mm")
     fields = {field: getattr(settings, field) for field in same}
     made = steps.do("optics", does, optics_step.BY, optics_step.Settings, fields, work, sources.files("board"))
     return None if made is None else made / optics_step.OPTICS
@@ -216,30 +223,45 @@ def correct_optics(steps: Store, sources: Sources, optics: Path | None) -> Path 
     settings, held = sources.settings, sources.held
     filmed = [sweep_part(name) for name, part in sources.sweeps.items() if set(CAMERAS) <= part.images.keys()]
     lit = held.surface is not None and set(CAMERAS) <= held.surface.images.keys()
+    bar = "; the ball bar isn't used" if settings.bars else ""
     if optics is None or held.surface is None or settings.drift_px == 0:
-        if settings.bars:
-            steps.leave_out(
-                "drift", "the ball bar isn't used: that needs a calibration, fringes on the skin, and drift_px above 0"
-            )
+        if bar:
+            steps.leave_out("drift", f"no calibration, no fringes on the skin, or drift_px=0{bar}")
         return optics
     try:
         known = calibration_files.read(optics).cameras
     except InputError as error:
-        steps.fail("drift", str(error))
+        steps.fail("drift", f"{error}{bar}")
         return optics
     if missing := [name for name in (*CAMERAS, PROJECTOR) if name not in known]:
-        steps.leave_out("drift", f"no calibration of {' and '.join(missing)}")
+        steps.leave_out("drift", f"no calibration of {' and '.join(missing)}{bar}")
         return optics
     if not lit:
-        steps.leave_out("drift", ONE_CAMERA)
+        steps.leave_out("drift", f"{ONE_CAMERA}{bar}")
         return optics
     same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "bars", "bar_mm", "ball_mm")
-    fields = {field: getattr(settings, field) for field in same} | {"calibration": optics}
-    given = [settings.networks or networks.WEIGHTS, *filter(None, [settings.target]), *settings.bars]
+    fields = {field: getattr(settings, field) for field in same} | {
+        "calibration": optics,
+        "board_scale": scale_left(steps, settings),
+    }
+    given = [settings.networks or networks.WEIGHTS, *filter(None, [settings.target]), *images_of(settings.bars)]
     made_of = sources.files("surface", *filmed) | _known_by(steps, "optics", optics, *given)
     does, work = "the calibration, corrected for drift", partial(drift_step.run, watch=sources.watch)
     made = steps.do("drift", does, drift_step.BY, drift_step.Settings, fields, work, made_of)
     return optics if made is None else made / drift_step.OPTICS
+
+
+def scale_left(steps: Store, settings: Settings) -> float | None:
+    """The board's scale that a calibration doesn't have in its covariance; None of one that this session made, which has it."""
+    return None if "optics" in steps.done else settings.board_scale
+
+
+def images_of(captures: Iterable[Path]) -> Iterator[Path]:
+    """Manifests, and files of the surfaces, of some captures."""
+    for capture in captures:
+        held = manifest.read_manifest(capture)
+        yield capture / MANIFEST
+        yield from (capture / held.root / name for name in ([] if held.surface is None else held.part("surface").paths()))
 
 
 def measure_skin(steps: Store, sources: Sources, optics: Path | None) -> Path | None:
@@ -276,6 +298,7 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, 
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
     same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
     fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
+    fields["board_scale"] = scale_left(steps, settings)
     if corrected and calibration_files.read(optics).uncertainty is not None:
         fields |= {"drift_px": WITHIN * settings.drift_px, "board_scale": None}
     weights = settings.networks or networks.WEIGHTS

@@ -24,12 +24,13 @@ class BoardField(Part):
     moisture; 1e-5 of chrome on glass. null: what the calibration says, and that of paper where it says nothing"""
 
 
-class BoardRowField(Part):
+class BoardLengthField(Part):
     """The field of a step that calibrates by a board of which one length was measured."""
 
-    board_row_mm: tuple[Positive, Positive] | None = None
-    """mm, distance of the first from the last point of the board's longest row, as measured, and its standard deviation: of
-    discs by a caliper, the mean of outer and inner edges, [240.1,0.03]. It gives the scale, which else is the description's"""
+    board_length_mm: tuple[Positive, Positive] | None = None
+    """mm, distance of the first from the last point of the board's longest row or column, as measured, and its standard
+    deviation: of discs by a caliper, the mean of outer and inner edges, [150.1,0.03]. It gives the scale, which else is the
+    description's"""
 
 
 class BarFields(Part):

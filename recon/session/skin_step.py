@@ -30,7 +30,6 @@ from recon.structured_light.triangulate import PointMap, Triangulator
 
 BY = "surface"  # who writes
 POINTS, SKIN, GLB = "points.npz", "surface.ply", "surface.glb"
-FOREIGN = 0.001  # points through which one camera sees, over those that both measure: of right captures some in a million
 MOSTLY = 0.8  # share of the triangulated points, beyond which those that are removed make a warning
 
 
@@ -217,10 +216,7 @@ def describe_fusion(view: View, fused: Fused) -> str:
     name = view.camera.name
     if fused.shared.any():
         both, apart = (f"{np.count_nonzero(mask):,}".replace(",", " ") for mask in (fused.shared, fused.apart))
-        line = f"{name} measures {both} points, too; {apart} left out, through which one of both sees"
-        if np.count_nonzero(fused.apart) <= FOREIGN * np.count_nonzero(fused.shared):
-            return f"fuse        {line}"
-        return f"warning     {line}: gloss, or a thing that came or went between both cameras' images?"
+        return f"fuse        {name} measures {both} points, too; {apart} left out, through which one of both sees"
     if np.isnan(fused.bias_px):
         return f"fuse        {name} improves no point: both cameras see too few alike"
     cause = "devices that drifted, which sonotwin correct-optics corrects, or another calibration?"

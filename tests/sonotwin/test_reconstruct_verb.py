@@ -164,7 +164,7 @@ def test_a_part_that_can_t_be_used_is_named_and_the_others_are_used(tank, tmp_pa
     (["find=cysts"], "reconstruct: find: expected"),
     (["spacing_mm=0"], "reconstruct: spacing_mm: expected"),
     (["spacing_mm=200"], "reconstruct: spacing_mm: expected"),
-    (["board_row_mm=[240.1,0.03]"], "board_row_mm: expected beside a board that the optics are calibrated by, found none"),
+    (["board_length_mm=[240.1,0.03]"], "board_length_mm: expected beside a board that the optics are calibrated by, found none"),
     (["bars=[nowhere]"], "reconstruct: bar_mm: expected beside bars, found nothing"),
     (["bars=[nowhere]", "bar_mm=[150.0,0.002]"], "nowhere/manifest.json: expected a file, found none"),
 ])  # fmt: skip

@@ -125,18 +125,19 @@ def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px
 
 
 def drawn_bar(true: Devices, centres_mm: Array, ball_mm: float, sigma_px: float, rng: np.random.Generator) -> BallBar:
-    """Points of two balls about centres : (2, 3) mm, as camera 1 and the fringes show them."""
+    """Points of two balls about centres : (2, 3) mm, as camera 1 and the fringes show them; neighbours share their noise."""
     camera, pixels, shown = true["cam1"], [], []
     for centre in centres_mm:
         middle, radius = camera.project(centre[None])[0], 0.7 * ball_mm / 2 * camera.matrix[0, 0] / centre[2]
-        disc = rng.uniform(-1, 1, (2000, 2))
-        seen = middle + radius * disc[np.hypot(*disc.T) < 1]
+        disc = rng.uniform(-1, 1, (1000, 2))
+        seen = np.repeat(middle + radius * disc[np.hypot(*disc.T) < 1], SHARED, axis=0)
         rays = camera.rays(seen)
         along = rays @ (centre - camera.centre)
         off = np.sum((centre - camera.centre) ** 2) - along**2
         places = camera.centre + (along - np.sqrt((ball_mm / 2) ** 2 - off))[:, None] * rays
         pixels.append(seen)
-        shown.append(true[PROJECTOR].project(places)[:, :1] + sigma_px * rng.standard_normal((len(seen), 1)))
+        noise = np.repeat(rng.standard_normal((len(seen) // SHARED, 1)), SHARED, axis=0)
+        shown.append(true[PROJECTOR].project(places)[:, :1] + sigma_px * noise)
     return BallBar((pixels[0], pixels[1]), (shown[0], shown[1]), (0,))
 
 

@@ -49,15 +49,6 @@ LEAST = 1e-9  # variance of a principal axis of the correlation, below which rou
 KnownLength = Literal["the print", "a ball bar in one place", "a ball bar in five places", "a target under a microscope"]
 
 
-class Outcome(NamedTuple):
-    """Of one drawn session."""
-
-    inside: bool  # what it shows of the devices, within its 95 % region
-    errors: "tuple[Errors, Errors, Errors]"  # of KINDS
-    size: float
-    surprise: float
-
-
 class Errors(NamedTuple):
     """Of the skin, as a calibration measures it."""
 
@@ -67,6 +58,15 @@ class Errors(NamedTuple):
     shape_mm: float  # RMS displacement less the rigid motion that fits best
     distance_mm: float  # RMS error of distances of 50 to 100 mm
     distance_ppm: float  # of these, relative
+
+
+class Outcome(NamedTuple):
+    """Of one drawn session."""
+
+    inside: bool  # what it shows of the devices, within its 95 % region
+    errors: tuple[Errors, Errors, Errors]  # of KINDS
+    size: float
+    surprise: float
 
 
 def sessions(

@@ -75,21 +75,24 @@ def test_an_error_within_the_calibration_is_no_alarm(equations, rng):
 
 
 def test_larger_noise_is_measured(equations, rng):
-    """Three times the predicted, whatever moved and erred, to 5 standard deviations of 29 degrees of freedom."""
+    """Three times the predicted, whatever moved and erred, to 5 standard deviations of 29 degrees of freedom, and none at all."""
     moved = measured(equations, rng, (1e3, -1e3))
     noisy = Equations(moved.residuals + np.sqrt(8) * rng.standard_normal(40), moved.spread, moved.faults)
     assert fault_tests.noise_factor(noisy) == pytest.approx(3, rel=5 / np.sqrt(2 * 29))
-    assert fault_tests.noise_factor(Equations(1e-3 * noisy.residuals, moved.spread, moved.faults)) == 1
+    quiet = Equations(1e-6 * noisy.residuals, moved.spread, moved.faults)
+    assert fault_tests.noise_factor(quiet) == pytest.approx(np.sqrt(200 / 229), rel=1e-3)
 
 
-def test_noise_of_many_equations_is_as_found(rng):
-    """A quarter of the predicted, by 396 degrees of freedom, to 5 standard deviations: so a motion shows four times as well."""
-    spread, slopes = rng.standard_normal((400, 2)), rng.standard_normal((400, 2))
-    quiet = Equations(0.25 * rng.standard_normal(400) + spread @ [3.0, -2.0], spread, {"first": Fault(slopes, np.ones(2))})
-    assert fault_tests.noise_factor(quiet) == pytest.approx(0.25, rel=5 / np.sqrt(2 * 396))
+@pytest.mark.parametrize("count", [40, 400, 4000])
+def test_smaller_noise_counts_as_far_as_equations_show_it(rng, count):
+    """A quarter of the predicted, which is worth 200 equations more: to 5 standard deviations."""
+    spread, slopes = rng.standard_normal((count, 2)), rng.standard_normal((count, 2))
+    quiet = Equations(0.25 * rng.standard_normal(count) + spread @ [3.0, -2.0], spread, {"first": Fault(slopes, np.ones(2))})
+    expected = np.sqrt((0.25**2 * (count - 4) + 200) / (count - 4 + 200))
+    assert fault_tests.noise_factor(quiet) == pytest.approx(expected, rel=5 / np.sqrt(2 * (count - 4)))
 
 
-def test_no_test_finds_more_than_the_best_chance(equations, rng):
+def test_the_best_chance_is_that_of_a_test_along_the_motion(equations, rng):
     """A motion of 3 sigma, tested along itself, is found as often as said, to 5 standard deviations; by any motion less often."""
     effect = equations.faults["first"].slopes[:, 0]
     weight = np.linalg.solve(np.eye(40) + equations.spread @ equations.spread.T, effect)

@@ -6,7 +6,7 @@ import trimesh
 from scipy.ndimage import gaussian_filter1d
 
 from recon.freehand import sequences
-from recon.freehand.place_uncertainty import GIVEN_MM, PlaceErrors
+from recon.freehand.place_uncertainty import PlaceErrors
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
@@ -74,7 +74,7 @@ def test_sigma_is_what_errs_alike_and_what_averages(skin):
     own = np.tile(np.diag([0, 0, 0, 0.2, 0.2, 0.2]) ** 2, (COUNT, 1, 1))
     errors = PlaceErrors(own, np.eye(COUNT), nothing, np.zeros((COUNT, 4, 4)))
     found = contact.measure(sweep(0.0, along_beam, errors), skin)
-    assert found.sigma_mm == pytest.approx(np.linalg.norm([0.1, 0.2 / np.sqrt(COUNT), GIVEN_MM]), rel=1e-6)
+    assert found.sigma_mm == pytest.approx(np.linalg.norm([0.1, 0.2 / np.sqrt(COUNT), contact.LIMITS.given_mm]), rel=1e-6)
 
 
 def test_the_latency_shows_where_the_probe_moves_along_its_beam(skin):
@@ -84,7 +84,7 @@ def test_the_latency_shows_where_the_probe_moves_along_its_beam(skin):
     nothing = np.zeros((COUNT, 6, 6))
     errors = PlaceErrors(nothing, np.eye(COUNT), nothing, rates, lag_s=0.01)
     found = contact.measure(sweep(0.0, np.zeros((8, 8)), errors), skin)
-    assert found.sigma_mm == pytest.approx(np.hypot(0.05, GIVEN_MM), rel=1e-6)
+    assert found.sigma_mm == pytest.approx(np.hypot(0.05, contact.LIMITS.given_mm), rel=1e-6)
 
 
 @pytest.mark.parametrize(("off_mm", "said"), [(-0.4, "within the measured skin"), (0.0, ""), (0.8, ""), (1.6, "doesn't reach")])
@@ -127,33 +127,16 @@ def over_dome(rng, motion_mm=(0.0, 0.0, 0.0), hidden=slice(0, 0)) -> contact.Con
     return contact.measure(scans, measured)
 
 
-@pytest.mark.parametrize("motion_mm", [(0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.5, 0.0, 0.0)])
-def test_a_skin_that_moved_aside_shows_along_a_dome(rng, motion_mm):
-    """Its length and direction within 3 sigma; the median distance, 0.15 mm off at most, tells nothing of it."""
-    found = over_dome(rng, motion_mm)
-    assert abs(found.median_mm) < 0.15
-    assert found.aside is not None and found.aside.surprise > contact.LIMITS.alarm_sigma
-    assert np.linalg.norm(found.aside.motion_mm - motion_mm) < 3 * found.aside.sigma_mm < 0.8
-    assert any(line.startswith("aside") and "as if the skin had moved aside" in line for line in found.lines)
-
-
-def test_a_skin_that_stayed_seldom_moves_aside(rng):
-    """Of 60 sweeps by unsteady hands, at 3 sigma, two at most: 0.3 % expected; by hands smoother than is assumed some more."""
-    found = [over_dome(rng).aside for _ in range(60)]
-    beyond = sum(one is not None and one.surprise > contact.LIMITS.alarm_sigma for one in found)
-    assert all(one is not None for one in found) and beyond <= 2
-
-
 def test_a_motion_along_the_beam_is_told_from_gel_by_nothing(rng):
-    """0.5 mm towards the probe: a distance within gel, of which the line says both causes, and no motion aside."""
+    """0.5 mm towards the probe: a distance within gel, of which the line says both causes."""
     found = over_dome(rng, (0.0, 0.0, -0.5))
-    assert 0.35 < found.median_mm < 0.6 and found.aside is not None and found.aside.surprise < 3
+    assert 0.35 < found.median_mm < 0.6
     assert "gel, or a skin that has risen" in found.lines[0] and not any("warning" in line for line in found.lines)
 
 
 def test_a_thing_that_lay_on_the_skin_is_said(rng):
-    """A finger in the measured skin, under eight of 134 B-scans: neither the median nor the motion aside goes with it."""
+    """A finger in the measured skin, under eight of 134 B-scans: the median doesn't go with it. One bad pose is no finger."""
     found = over_dome(rng, hidden=slice(20, 28))
     assert 4 <= found.foreign <= 30 and abs(found.median_mm) < 0.15
-    assert found.aside is not None and found.aside.surprise < 3
     assert any("hand or a cloth" in line for line in found.lines)
+    assert not any("hand or a cloth" in line for line in contact.Contact(np.append(np.zeros(199), -3.2), 0.07).lines)
