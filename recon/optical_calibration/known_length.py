@@ -20,10 +20,11 @@ Array = NDArray[np.float64]
 
 BEYOND = 5.0  # standard deviations, from which on a length isn't this board's
 CALIPER_MM = 0.03  # standard deviation by a caliper, for which 0.02 mm are claimed
+WORTHWHILE = 0.7  # of the scale's standard deviation, that a better way has to reach
 WAYS = (  # to a scale that is better known, the cheapest first: relative standard deviations
     ("views of a target whose lengths a microscope gave to 0.002 mm (rig.target)", 5e-5),
     ("a ball bar in five places (bars)", 3e-5),
-    ("a board of chrome on glass (board_scale)", 1e-5),
+    ("calibrating by a board of chrome on glass (board_scale)", 1e-5),
 )
 
 
@@ -92,7 +93,7 @@ def length_of(points: Array, ends: tuple[int, int]) -> float:
 
 
 def describe(sigma: float, length_mm: float | None = None) -> str:
-    """A line: the relative standard deviation of the scale, and the cheapest way to half of it.
+    """A line: the relative standard deviation of the scale, and the cheapest way to a better one.
 
     length_mm : of the board's longest line of points, that a caliper may measure
     """
@@ -102,7 +103,7 @@ def describe(sigma: float, length_mm: float | None = None) -> str:
             (f"a caliper over the board's longest line of {length_mm:.0f} mm (board_length_mm)", CALIPER_MM / length_mm),
             *WAYS,
         )
-    better = (f"; {way} would make it {1e6 * reached:.0f}" for way, reached in ways if reached <= sigma / 2)
+    better = (f"; {way} would make it {1e6 * reached:.0f}" for way, reached in ways if reached <= WORTHWHILE * sigma)
     return f"scale       known to {1e6 * sigma:.0f} ppm{next(better, '')}"
 
 

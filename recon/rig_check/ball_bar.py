@@ -40,10 +40,14 @@ class Limits:
     least: int = 300  # points of a ball: fewer than of one of 20 px across
     most: int = 20_000  # of these that are fitted
     slopes: int = 500  # of these by which slopes are taken
+    doubt_sigma: float = 3.0  # of what calibration and usual drift leave, from which on a length is doubted
     alarm_sigma: float = 5.0  # of what calibration and usual drift leave, from which on a length isn't this bar's
 
 
 LIMITS = Limits()
+COMMON_PX = (
+    0.03  # projector px, by which a sequence's phases err alike, against another's: gratings' shifts of some 5 % of a step
+)
 
 
 class BallBar(NamedTuple):
@@ -66,7 +70,7 @@ class Measured(NamedTuple):
     """The bar's length by a calibration."""
 
     length_mm: float
-    sigma_mm: float  # by noise of the fringes
+    sigma_mm: float  # by noise of the fringes, and by what they err alike
     by_optics: Array  # (g,) mm by the calibration's parameters
     balls_mm: tuple[float, float]  # diameters
 
@@ -107,7 +111,7 @@ def find(
             sizes = ", ".join(f"{diameter:.2f} mm" for diameter in diameters) or "none"
             raise InputError(
                 f"{name}: expected two balls of {ball_mm:g} mm before {CAMERAS[0]} and {PROJECTOR}, found {sizes}: is ball_mm "
-                "their diameter, do both see them, and have the patterns a code, by which separate things are put in place?"
+                "their diameter, do both see them, and do the patterns put separate things in place, as gray_surface does?"
             )
         balls.append(own)
     chosen = [own[:: -(-len(own) // limits.most)] for own in balls]
@@ -117,15 +121,18 @@ def find(
 
 def measure(bar: BallBar, cameras: Mapping[str, Camera], names: Sequence[str], limits: Limits = LIMITS) -> Measured:
     """Measure the bar's length by devices, with its slopes by parameters of names as of `Uncertainty`."""
-    fits, slopes = [], []
+    fits, slopes, shifted, centre = [], [], [], (f"{PROJECTOR}.{('cx', 'cy')[bar.axes[0]]}",)
     for pixels, shown in zip(bar.pixels, bar.shown, strict=True):
         fits.append(fit_sphere(points_by_light(pixels, shown, bar.axes, cameras)))
         some = slice(None, None, -(-len(pixels) // limits.slopes))
-        slopes.append(_centre_slopes(points_by_light(pixels[some], shown[some], bar.axes, cameras), bar.axes, cameras, names))
+        places = points_by_light(pixels[some], shown[some], bar.axes, cameras)
+        slopes.append(_centre_slopes(places, bar.axes, cameras, names))
+        shifted.append(_centre_slopes(places, bar.axes, cameras, centre)[:, 0])
     apart = fits[1].shape.centre - fits[0].shape.centre
     length = float(np.linalg.norm(apart))
     along = apart / length
     variance = SHARED * sum(along @ fit.covariance[:3, :3] @ along for fit in fits)
+    variance += (COMMON_PX * float(along @ (shifted[1] - shifted[0]))) ** 2
     balls = (2 * fits[0].shape.radius, 2 * fits[1].shape.radius)
     return Measured(length, float(np.sqrt(variance)), along @ (slopes[1] - slopes[0]), balls)
 

@@ -66,6 +66,7 @@ class Corrected:
     drift: Drift
     matches: Matches | None
     views: int
+    bars: Bars | None
     figures: Metrics
 
     @property
@@ -135,7 +136,7 @@ def correct(
     """
     known = target if settings.target is None else with_open_scale(target)
     found = drift.estimate(calibration, film or None, matches, known, settings.board_scale, settings.drift_px, bars)
-    return Corrected(found, matches, len(film), measure(found, matches, film))
+    return Corrected(found, matches, len(film), bars, measure(found, matches, film))
 
 
 def find_bars(settings: Settings, file: Path, calibration: Calibration, watch: Watch) -> Bars | None:
@@ -169,6 +170,10 @@ def find_bars(settings: Settings, file: Path, calibration: Calibration, watch: W
                 f"{capture}: bar_mm: expected a bar's length by calibration and usual drift, found {length}: {cause}"
             )
         watch.say(f"bar         {length}; balls of {balls} mm")
+        if abs(off) > ball_bar.LIMITS.doubt_sigma:
+            watch.say(
+                "warning     the bar is taken at its word: is bar_mm as in its certificate, and the board as it is described?"
+            )
     return Bars(tuple(seen), length_mm, sigma_mm)
 
 
@@ -298,7 +303,8 @@ def describe(found: Corrected) -> Iterator[str]:
     if "skin_moved_mm" in found.figures:
         moved, before, left = (found.figures[f"skin_{name}_mm"] for name in ("moved", "sigma_before", "sigma"))
         yield f"apart       skin from target by {moved:.3f} mm uncorrected (1 sigma {before:.3f}), and now 1 sigma {left:.3f} mm"
-    yield known_length.describe(1e-6 * float(found.figures["scale_sigma_ppm"]))
+    if found.drift.before.uncertainty is not None:
+        yield known_length.describe(1e-6 * float(found.figures["scale_sigma_ppm"]))
 
 
 def write_page(found: Corrected, name: str) -> str:
@@ -319,6 +325,10 @@ def write_page(found: Corrected, name: str) -> str:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]
         figures += [("skin from target, uncorrected", f"{moved:.3f}", "mm"), ("left, 1 σ", f"{left:.3f}", "mm")]
     figures.append(("scale, 1 σ", f"{found.figures['scale_sigma_ppm']:.0f}", "ppm"))
+    if found.bars is not None:
+        figures.append(("ball bar, certified", f"{found.bars.length_mm:g} ± {found.bars.sigma_mm:g}", "mm"))
+        lengths = (ball_bar.measure(bar, found.drift.before.cameras, ()).length_mm for bar in found.bars.seen)
+        figures.append(("as calibrated before", ", ".join(f"{length:.3f}" for length in lengths), "mm"))
     return page.render(Opening("Drift since the calibration", name, result, figures), sections, FOOTER)
 
 

@@ -136,7 +136,7 @@ def calibrate(
     result, larger = known_length.with_length(result, board_scale, board_length_mm, captured.name)
     figures = figures_of_merit.measure(result, truth)
     if board_length_mm is not None:
-        figures["scale_change_ppm"] = 1e6 * larger
+        figures |= {"board_length_mm": board_length_mm[0], "scale_change_ppm": 1e6 * larger}
     contradicting = {name: reason for name, reason in result.dropped.items() if name not in missed}
     for line in (*dropped(contradicting), *turned(result), *describe(result, figures, seconds["seconds_adjust"])):
         watch.say(line)
@@ -181,9 +181,13 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
         scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
         yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
-        if "scale_change_ppm" in figures:
-            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by a length of the board, in place of its description"
         ends = known_length.longest(result.observations.points)
+        by_images = known_length.length_of(result.adjustment.points, ends) / (
+            1 + 1e-6 * float(figures.get("scale_change_ppm", 0))
+        )
+        if "scale_change_ppm" in figures:
+            told = f"{figures['board_length_mm']:.3f} mm, {by_images:.3f} by the images"
+            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by {told}"
         yield known_length.describe(
             1e-6 * float(figures["scale_sigma_ppm"]), known_length.length_of(result.adjustment.points, ends)
         )

@@ -24,21 +24,34 @@ class BoardField(Part):
     moisture; 1e-5 of chrome on glass. null: what the calibration says, and that of paper where it says nothing"""
 
 
+def _check_sigma(name: str, known: tuple[float, float] | None) -> None:
+    """Check that a length is no pair of lengths."""
+    worst = 0.01  # of a length, that a standard deviation may be
+    if known is not None and known[1] > worst * known[0]:
+        expected = f"expected a length and its standard deviation, at most {100 * worst:g} % of it"
+        raise ValueError(f"{name}: {expected}, found {list(known)}: two lengths?")
+
+
 class BoardLengthField(Part):
     """The field of a step that calibrates by a board of which one length was measured."""
 
     board_length_mm: tuple[Positive, Positive] | None = None
     """mm, distance of the first from the last point of the board's longest row or column, as measured, and its standard
-    deviation: of discs by a caliper, the mean of outer and inner edges, [150.1,0.03]. It gives the scale, which else is the
-    description's"""
+    deviation: [150.1,0.03]. Of discs by a caliper, the mean of outer and inner edges; of asymmetric circles the column through
+    every other row, the first one. It gives the scale, which else is the description's"""
+
+    @model_validator(mode="after")
+    def _exact_enough(self) -> "BoardLengthField":
+        _check_sigma("board_length_mm", self.board_length_mm)
+        return self
 
 
 class BarFields(Part):
     """Fields of a step that corrects the scale by a ball bar."""
 
     bars: tuple[Path, ...] = ()
-    """capture folders with fringes and a code before a ball bar, two balls of matt paint, which gives the scale: one, or better
-    some, with the bar in other places; taken on the same day"""
+    """capture folders with fringes and a code (such as patterns=gray_surface) before camera 1 of a ball bar, two balls of matt
+    paint, which gives the scale: one, or better some, with the bar in other places; taken on the same day, before or after"""
     bar_mm: tuple[Positive, Positive] | None = None
     """mm, certified distance of the balls' centres, and its standard deviation: [150.012,0.002]"""
     ball_mm: Positive = 25.4
@@ -49,6 +62,9 @@ class BarFields(Part):
         if bool(self.bars) != (self.bar_mm is not None):
             lacking, given = ("bar_mm", "bars") if self.bars else ("bars", "bar_mm")
             raise ValueError(f"{lacking}: expected beside {given}, found nothing")
+        if len({path.resolve() for path in self.bars}) < len(self.bars):
+            raise ValueError("bars: expected each capture once, found one twice")
+        _check_sigma("bar_mm", self.bar_mm)
         return self
 
 

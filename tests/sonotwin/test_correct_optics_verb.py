@@ -185,6 +185,9 @@ def test_a_ball_bar_tells_the_scale(drifted, bar, tmp_path, capsys):
         (["bar_mm=[150.0,0.005]"], "bars: expected beside bar_mm, found nothing"),
         (["bars=[BAR]", "bar_mm=[150.0,0.005]", "ball_mm=40"], "expected two balls of 40 mm before cam1 and projector, found "),
         (["bars=[SKIN]", "bar_mm=[150.0,0.005]"], "expected two balls of 25.4 mm before cam1 and projector, found "),
+        (["bars=[BAR,BAR]", "bar_mm=[150.0,0.005]"], "bars: expected each capture once, found one twice"),
+        (["bars=[BAR]", "bar_mm=[150.0,150.0]"], "bar_mm: expected a length and its standard deviation, at most 1 % of it"),
+        (["bars=[BAR]", "bar_mm=[151.5,0.005]"], "bar_mm: expected a bar's length by calibration and usual drift, found 150."),
         (["bars=[nowhere]", "bar_mm=[150.0,0.005]"], "nowhere/manifest.json: expected a file, found none"),
     ],
 )

@@ -21,7 +21,7 @@ from recon.model.calibration import Uncertainty, moved
 from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
-from recon.rig_check.ball_bar import BallBar
+from recon.rig_check.ball_bar import COMMON_PX, BallBar
 from recon.rig_check.bottom_equations import Lines
 from recon.rig_check.fringe_matches import FLOOR_PX, HALF, MOST, SHARED
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
@@ -126,7 +126,7 @@ def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px
 
 def drawn_bar(true: Devices, centres_mm: Array, ball_mm: float, sigma_px: float, rng: np.random.Generator) -> BallBar:
     """Points of two balls about centres : (2, 3) mm, as camera 1 and the fringes show them; neighbours share their noise."""
-    camera, pixels, shown = true["cam1"], [], []
+    camera, pixels, shown, alike = true["cam1"], [], [], COMMON_PX * rng.standard_normal()
     for centre in centres_mm:
         middle, radius = camera.project(centre[None])[0], 0.7 * ball_mm / 2 * camera.matrix[0, 0] / centre[2]
         disc = rng.uniform(-1, 1, (1000, 2))
@@ -137,7 +137,7 @@ def drawn_bar(true: Devices, centres_mm: Array, ball_mm: float, sigma_px: float,
         places = camera.centre + (along - np.sqrt((ball_mm / 2) ** 2 - off))[:, None] * rays
         pixels.append(seen)
         noise = np.repeat(rng.standard_normal((len(seen) // SHARED, 1)), SHARED, axis=0)
-        shown.append(true[PROJECTOR].project(places)[:, :1] + sigma_px * noise)
+        shown.append(true[PROJECTOR].project(places)[:, :1] + sigma_px * noise + alike)
     return BallBar((pixels[0], pixels[1]), (shown[0], shown[1]), (0,))
 
 

@@ -105,7 +105,7 @@ def test_the_longest_line_is_a_row_or_a_column():
     assert known_length.length_of(design[:, [1, 0, 2]], known_length.longest(design[:, [1, 0, 2]])) == pytest.approx(150)
 
 
-def test_the_way_to_a_better_scale_is_the_cheapest_that_halves_it():
-    assert "caliper" in known_length.describe(3e-4, 240.0) and "125" in known_length.describe(3e-4, 240.0)
+def test_the_way_to_a_better_scale_is_the_cheapest_that_is_worth_while():
+    assert "caliper" in known_length.describe(3e-4, 150.0) and "200" in known_length.describe(3e-4, 150.0)
     assert "microscope" in known_length.describe(3e-4) and "glass" in known_length.describe(4e-5)
     assert known_length.describe(1e-5) == "scale       known to 10 ppm"
