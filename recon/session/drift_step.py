@@ -316,6 +316,11 @@ def write_page(found: Corrected, name: str) -> str:
                 change, sigma = told[f"{device}.{parameter}"]
                 rows.append((device, LABELS[parameter], f"{factor * change:+.3f} {unit}", f"{factor * sigma:.3f} {unit}"))
     blocks = [page.table(("device", "parameter", "change", "1 σ of the value"), rows)]
+    if found.bars is not None:
+        certified = f"{found.bars.length_mm:g} ± {found.bars.sigma_mm:g} mm"
+        lengths = [ball_bar.measure(bar, found.drift.before.cameras, ()).length_mm for bar in found.bars.seen]
+        told = [(str(place), certified, f"{length:.3f} mm") for place, length in enumerate(lengths, 1)]
+        blocks.append(page.table(("ball bar, place", "certified", "as calibrated before"), told))
     lines = [page.paragraph(line) for line in READING]
     sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
     figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
@@ -325,10 +330,6 @@ def write_page(found: Corrected, name: str) -> str:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]
         figures += [("skin from target, uncorrected", f"{moved:.3f}", "mm"), ("left, 1 σ", f"{left:.3f}", "mm")]
     figures.append(("scale, 1 σ", f"{found.figures['scale_sigma_ppm']:.0f}", "ppm"))
-    if found.bars is not None:
-        figures.append(("ball bar, certified", f"{found.bars.length_mm:g} ± {found.bars.sigma_mm:g}", "mm"))
-        lengths = (ball_bar.measure(bar, found.drift.before.cameras, ()).length_mm for bar in found.bars.seen)
-        figures.append(("as calibrated before", ", ".join(f"{length:.3f}" for length in lengths), "mm"))
     return page.render(Opening("Drift since the calibration", name, result, figures), sections, FOOTER)
 
 
