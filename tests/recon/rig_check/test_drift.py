@@ -6,10 +6,10 @@ import pytest
 from recon.geometry import rigid
 from recon.geometry.camera_jacobian import MOTION
 from recon.model import circle_layout
-from recon.model.calibration import DRIFT_PX, Calibration
+from recon.model.calibration import DRIFT_PX, Calibration, Uncertainty
 from recon.optical_calibration import uncertainty
-from recon.rig_check import drift
-from recon.rig_check.optics_equations import points_by_light
+from recon.rig_check import drift, optics_equations
+from recon.rig_check.optics_equations import DeviceRows, points_by_light
 from recon.session import drift_step
 from recon.tracking.pose_fit import meet
 from twin.experiments import drawn_check
@@ -128,3 +128,14 @@ def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
     assert abs(np.mean(np.square(normal)) - 1) < 4 * np.sqrt(2 / 10)
     by_cameras = drift.estimate(calibration, film, None, drift_step.with_open_scale(target), 3e-4, DRIFT_PX).after
     assert uncertainty.scale(by_cameras, "cam1", "cam2", volume) > 2.9e-4
+
+
+def test_points_that_are_far_off_are_left_out_though_motions_bend_to_them(rig, rng):
+    """Rims, a thirtieth of the points at one side, by 2000 standard deviations: all of them, and of the others hardly any."""
+    names = tuple(f"{device}.{name}" for device in ("cam2", "projector") for name in MOTION)
+    places = np.sort(rng.uniform(-1, 1, 1000))
+    wrong = places > np.quantile(places, 29 / 30)
+    slopes = 1e5 * np.polynomial.chebyshev.chebvander(places, len(names) - 1)
+    rows = DeviceRows(rng.standard_normal(1000) + 2000.0 * wrong, slopes, np.zeros((1000, len(rig.target.LENGTHS))))
+    left = optics_equations.agreeing(rows, rig.target, Uncertainty(names, 1e-8 * np.eye(len(names))), names, 1)
+    assert np.abs(left.residuals).max() < 100 and len(left.residuals) > 0.98 * np.count_nonzero(~wrong)
