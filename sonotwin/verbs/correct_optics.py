@@ -1,7 +1,7 @@
 """Correct a calibration for what cameras and projector drifted since, by what a session's own images show.
 
 Reads a capture folder with the calibration in use and any of two parts: a fringe sequence of skin, or of anything smooth, taken
-by both cameras; and frames in which both see the probe's target. Further captures, of a ball bar of certified length under fringes
+by both cameras; and frames in which both see the probe's target. Further captures, of a certified ball bar under fringes
 and a code before camera 1, give the scale. Writes into the folder `out`: optics.yaml, the calibration as it is now, with its
 covariance, for all other commands; drift.html, what drifted and what it would have cost; metrics.json. Refuses what is no drift,
 such as a camera that was pushed. Takes some seconds.
