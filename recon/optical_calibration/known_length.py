@@ -23,7 +23,7 @@ CALIPER_MM = 0.03  # standard deviation by a caliper, for which 0.02 mm are clai
 WORTHWHILE = 0.7  # of the scale's standard deviation, that a better way has to reach
 WAYS = (  # to a scale that is better known, the cheapest first: relative standard deviations
     ("views of a target whose lengths a microscope gave to 0.002 mm (rig.target)", 5e-5),
-    ("a ball bar in five places (bars)", 3e-5),
+    ("a ball bar in five places (bars)", 4e-5),
     ("calibrating by a board of chrome on glass (board_scale)", 1e-5),
 )
 
