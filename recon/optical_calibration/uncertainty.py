@@ -121,10 +121,14 @@ def scale(
     calibration: Calibration, first: str, second: str, volume: Array, pixel_sigma: tuple[ArrayLike, ArrayLike] = (1.0, 1.0)
 ) -> float:
     """Standard deviation of the scale of lengths in a volume : (k, 3) mm, as a ratio: 1e-4 is 0.1 mm in 1 m."""
-    modes = np.concatenate([rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
-    stretch = _modes(calibration, first, second, volume, modes, pixel_sigma)[-1]
+    stretch = _modes(calibration, first, second, volume, similarity_modes(volume), pixel_sigma)[-1]
     variance = stretch @ _known(calibration).covariance @ stretch
     return float(np.sqrt(max(variance, 0.0)))  # rounding may leave a zero below zero
+
+
+def similarity_modes(points: Array) -> Array:
+    """Displacements : (m, 3, 7) of points : (m, 3) mm by small turns and shifts of all, and by a growth about their middle."""
+    return np.concatenate([rigid_modes(points), (points - points.mean(axis=0))[..., None]], axis=-1)
 
 
 def mean_squares(calibration: Calibration, first: str, second: str, volume: Array) -> tuple[Array, Array]:

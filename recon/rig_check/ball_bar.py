@@ -16,7 +16,7 @@ from recon.errors import InputError
 from recon.estimation.covariance import whitening
 from recon.geometry.camera import Camera
 from recon.geometry.primitives import Fit, Sphere, fit_sphere
-from recon.model.calibration import Calibration, linearise
+from recon.model.calibration import Uncertainty, linearise
 from recon.rig_check.fringe_matches import SHARED
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, DeviceRows, points_by_light
 from recon.structured_light.decode import ProjectorMap
@@ -137,13 +137,14 @@ def measure(bar: BallBar, cameras: Mapping[str, Camera], names: Sequence[str], l
     return Measured(length, float(np.sqrt(variance)), along @ (slopes[1] - slopes[0]), balls)
 
 
-def departure(bars: Bars, calibration: Calibration) -> Array:
-    """Measured less certified lengths : (n,), in standard deviations of what the calibration's uncertainty and noise leave."""
-    known = calibration.uncertainty
-    assert known is not None
-    found = [measure(bar, calibration.cameras, known.names) for bar in bars.seen]
-    variances = [one.by_optics @ known.covariance @ one.by_optics + one.sigma_mm**2 + bars.sigma_mm**2 for one in found]
-    return (np.array([one.length_mm for one in found]) - bars.length_mm) / np.sqrt(variances)
+def departure(found: Measured, certified_mm: tuple[float, float], known: Uncertainty) -> float:
+    """Measured less certified length, in standard deviations of what the calibration's uncertainty, noise and certificate leave.
+
+    found : with slopes by the uncertainty's parameters
+    """
+    length_mm, sigma_mm = certified_mm
+    variance = found.by_optics @ known.covariance @ found.by_optics + found.sigma_mm**2 + sigma_mm**2
+    return float((found.length_mm - length_mm) / np.sqrt(variance))
 
 
 def equations(bars: Bars, cameras: Mapping[str, Camera], names: Sequence[str], lengths: int) -> DeviceRows:

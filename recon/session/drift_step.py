@@ -152,7 +152,7 @@ def find_bars(settings: Settings, file: Path, calibration: Calibration, watch: W
     if settings.bar_mm is None:
         return None
     length_mm, sigma_mm = settings.bar_mm
-    used = replace(calibration, uncertainty=drift.expected(calibration, settings.board_scale, settings.drift_px))
+    known = drift.expected(calibration, settings.board_scale, settings.drift_px)
     seen = []
     for capture in settings.bars:
         shots = surface_part.read_surface(capture, CAMERAS[0], file)
@@ -160,9 +160,9 @@ def find_bars(settings: Settings, file: Path, calibration: Calibration, watch: W
             shots.images, shots.patterns, bits=shots.bits, name=f"{shots.name}: {CAMERAS[0]}", camera=CAMERAS[0]
         )
         seen.append(ball_bar.find(found, calibration.cameras, settings.ball_mm, str(capture)))
-        by_light = ball_bar.measure(seen[-1], calibration.cameras, ())
+        by_light = ball_bar.measure(seen[-1], calibration.cameras, known.names)
         balls = " and ".join(f"{ball:.2f}" for ball in by_light.balls_mm)
-        off = float(ball_bar.departure(Bars((seen[-1],), length_mm, sigma_mm), used)[0])
+        off = ball_bar.departure(by_light, settings.bar_mm, known)
         length = f"{by_light.length_mm:.3f} mm of {length_mm:g}, {off:+.1f} sigma of calibration and usual drift"
         if abs(off) > ball_bar.LIMITS.alarm_sigma:
             cause = "another bar, another distance of its balls, or devices that were pushed? board_scale=... is of a worse print"

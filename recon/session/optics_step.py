@@ -181,16 +181,12 @@ def describe(result: Result, figures: Metrics, seconds: float) -> Iterator[str]:
         point, shape = (shown(figures[f"{name}_sigma_mm"], ".4f", " mm") for name in ("point", "shape"))
         scale = shown(figures["scale_sigma_ppm"], ".0f", " ppm")
         yield f"uncertain   point {point}, within a shape {shape}, scale {scale} (1 sigma)"
-        ends = known_length.longest(result.observations.points)
-        by_images = known_length.length_of(result.adjustment.points, ends) / (
-            1 + 1e-6 * float(figures.get("scale_change_ppm", 0))
-        )
+        length = known_length.length_of(result.adjustment.points, known_length.longest(result.observations.points))
         if "scale_change_ppm" in figures:
-            told = f"{figures['board_length_mm']:.3f} mm, {by_images:.3f} by the images"
-            yield f"scale       {figures['scale_change_ppm']:+.0f} ppm by {told}"
-        yield known_length.describe(
-            1e-6 * float(figures["scale_sigma_ppm"]), known_length.length_of(result.adjustment.points, ends)
-        )
+            change = float(figures["scale_change_ppm"])
+            told = f"{figures['board_length_mm']:.3f} mm, {length / (1 + 1e-6 * change):.3f} by the images"
+            yield f"scale       {change:+.0f} ppm by {told}"
+        yield known_length.describe(1e-6 * float(figures["scale_sigma_ppm"]), length)
     else:
         seen = shown(figures[f"projection_sigma_{devices[0]}_px"], ".4f", " px")
         yield f"uncertain   projection {seen} (1 sigma); one camera alone measures no points"

@@ -6,9 +6,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from recon.geometry import rigid
-from recon.geometry.primitives import Plane, Sphere
+from recon.geometry.primitives import Shape, Sphere
 from recon.model.rig import Fraction, Part, Positive, Vector
 from scenes import solid_meshes
+from scenes.kinds import plane
 from scenes.scene_types import Material, Scene, Thing
 
 
@@ -38,7 +39,8 @@ def build(config: Config) -> Scene:
     """The balls, with their exact shapes for a renderer that has spheres, the rod between them, and the background."""
     middle, turn = np.array(config.middle_mm), np.deg2rad(config.turn_deg)
     along = np.array([np.cos(turn), np.sin(turn), 0.0])
-    paint, things, shapes = Material(config.reflectance), [], []
+    paint, things = Material(config.reflectance), []
+    shapes: list[Shape] = []
     for name, side in (("first", -0.5), ("second", 0.5)):
         centre = middle + side * config.length_mm * along
         ball = Sphere(name, centre, config.ball_mm / 2)
@@ -49,8 +51,7 @@ def build(config: Config) -> Scene:
     lying = rigid.transform(np.column_stack([along, np.cross(upright, along), upright]), middle)
     things.append(Thing("rod", solid_meshes.moved(solid_meshes.rod(config.rod_mm / 2, config.length_mm), lying), paint))
     if config.background_mm is not None:
-        place = rigid.transform(np.eye(3), (middle[0], middle[1], config.background_mm))
-        background = solid_meshes.moved(solid_meshes.plate((320, 260), 5), place)
-        things.append(Thing("background", background, Material(config.background_reflectance), smooth=False))
-        shapes.append(Plane("background", place[:3, 3], np.array([0.0, 0.0, -1.0])))
+        background, front = plane.behind(middle[0], middle[1], config.background_mm, config.background_reflectance)
+        things.append(background)
+        shapes.append(front)
     return Scene("ball_bar", tuple(things), tuple(shapes))

@@ -40,6 +40,14 @@ def build(config: Config) -> Scene:
     return Scene("plane", (Thing("plate", mesh, Material(config.reflectance), smooth=False),), (plane,))
 
 
+def behind(x: float, y: float, z: float, reflectance: float) -> tuple[Thing, Plane]:
+    """A background : a plate of the usual size that faces camera 1, the middle of its front at x, y, z mm, and its plane."""
+    place = rigid.transform(np.eye(3), (x, y, z))
+    background = solid_meshes.moved(solid_meshes.plate((320, 260), THICKNESS_MM), place)
+    thing = Thing("background", background, Material(reflectance), smooth=False)
+    return thing, Plane("background", place[:3, 3], np.array([0.0, 0.0, -1.0]))
+
+
 def tilted(centre_mm: Vector, tilt_deg: tuple[float, float]) -> rigid.Array:
     """Pose `world_from_plate` : (4, 4) of a plate turned about the world's x axis, then about its y axis."""
     rotation = Rotation.from_euler("xy", np.asarray(tilt_deg), degrees=True)

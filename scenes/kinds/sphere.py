@@ -6,9 +6,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from recon.geometry import rigid
-from recon.geometry.primitives import Plane, Shape, Sphere
+from recon.geometry.primitives import Shape, Sphere
 from recon.model.rig import Fraction, Part, Positive, Vector
 from scenes import solid_meshes
+from scenes.kinds import plane
 from scenes.scene_types import Material, Scene, Thing
 
 
@@ -37,8 +38,7 @@ def build(config: Config) -> Scene:
     things = [Thing("sphere", mesh, Material(config.reflectance), primitive=sphere)]
     shapes: list[Shape] = [sphere]
     if config.background_mm is not None:
-        place = rigid.transform(np.eye(3), (centre[0], centre[1], config.background_mm))
-        background = solid_meshes.moved(solid_meshes.plate((320, 260), 5), place)
-        things.append(Thing("background", background, Material(config.background_reflectance), smooth=False))
-        shapes.append(Plane("background", place[:3, 3], np.array([0.0, 0.0, -1.0])))
+        background, front = plane.behind(centre[0], centre[1], config.background_mm, config.background_reflectance)
+        things.append(background)
+        shapes.append(front)
     return Scene("sphere", tuple(things), tuple(shapes))

@@ -57,7 +57,7 @@ class Told(NamedTuple):
     """Of a drawn rig after a move."""
 
     verdicts: list[Verdict]
-    limit: float = np.nan  # chance at which no test finds the move more often
+    limit: float = np.nan  # chance at which the best unbiased test finds the move
 
 
 class Laboratory(NamedTuple):
@@ -93,7 +93,7 @@ def laboratory(rig: Rig, life: Conditions, drift_px: float) -> Laboratory:
 def _counted(checked: Callable[[int, Devices], dict[str, Told]], lab: Laboratory, rigs: int) -> Figures:
     """Shares of drawn rigs, of the verdicts on each by the move: what moved is found, or found alone; and false alarms.
 
-    Beside them the largest share that any test finds.
+    Beside them the share that the best unbiased test finds.
     """
     alarms, found, named, limit = set(), Counter(), Counter(), defaultdict(float)
     for k in range(rigs):

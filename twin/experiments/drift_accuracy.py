@@ -185,8 +185,7 @@ def scales(setup: Setup, by: KnownLength, sessions: int = 100) -> Figures:
         volume = uncertainty.working_volume(after, DEPTHS_MM)
         pair = [cameras[name] for cameras in (after.cameras, true) for name in CAMERAS]
         moved = meet(pair[:2], [camera.project(volume) for camera in pair[2:]])[0] - volume
-        modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
-        error = np.linalg.lstsq(modes.reshape(-1, 7), moved.ravel())[0][-1]
+        error = np.linalg.lstsq(uncertainty.similarity_modes(volume).reshape(-1, 7), moved.ravel())[0][-1]
         found.append((error, uncertainty.scale(after, *CAMERAS, volume)))
     error, sigma = np.array(found).T
     return {

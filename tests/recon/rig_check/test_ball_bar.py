@@ -92,8 +92,9 @@ def test_nothing_in_the_images_is_no_bar(calibration, rng):
 def test_a_bar_of_another_length_departs(calibration, rng):
     """By 0.5 mm of 150, where a print to 3e-4 and usual drift leave 0.06: beyond 5 sigma; as certified within 3."""
     bar = drawn_bar(calibration.cameras, rng)
-    used = replace(calibration, uncertainty=drift.expected(calibration, 3e-4, DRIFT_PX))
-    right, wrong = (abs(ball_bar.departure(Bars((bar,), LENGTH + off, 0.002), used)[0]) for off in (0.0, 0.5))
+    known = drift.expected(calibration, 3e-4, DRIFT_PX)
+    found = ball_bar.measure(bar, calibration.cameras, known.names)
+    right, wrong = (abs(ball_bar.departure(found, (LENGTH + off, 0.002), known)) for off in (0.0, 0.5))
     assert right < 0.5 and 5 < wrong < 20
 
 
