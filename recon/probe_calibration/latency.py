@@ -1,9 +1,9 @@
 """Time calibration: the lag of the scanner's images behind the poses, from an up-and-down motion over a flat bottom.
 
-The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag)` with six coordinates x of its pose. Above all
-it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
-millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. Both
-streams have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at
+The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t` with six coordinates x of its pose. Above
+all it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
+millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. The
+trend c is of a bracket that gives: by 0.1 mm over an uneven motion it would look like a lag of 2 ms. Both streams have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at
 the moment of each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other
 by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
 
@@ -41,6 +41,7 @@ RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion
 VALLEY = 0.8  # correlation between two such lags, over the best, that separates them
 MOST_PAIRED = 1000  # images by whose pairs the fit begins
 GATE = 4.0  # normalised residual of an outlier
+ALIKE_S = 0.3  # within which errors go together: the spline's, and those of a hand that tilts far
 COVERAGE = 0.95  # of the interval
 BLOCK_PX = 8  # columns taken together
 BOTTOM_SIGMA_PX = 1.5  # smoothing in depth
@@ -230,25 +231,25 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
 
 
 def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float, search_s: tuple[float, float]) -> Lag:
-    """Weighted least squares over a, b and the lag, with variances of depth and of time estimated from the residuals."""
-    lag, speed = start, spline.derivative()
+    """Weighted least squares over a, b, c and the lag, with variances of depth and of time estimated from the residuals."""
+    lag, speed, trend = start, spline.derivative(), seconds - seconds.mean()
     seen = np.isfinite(depths)
     used = seen & _within(moments, seconds - lag)
-    line = np.zeros(1 + spline(start).size)  # a, b
+    line = np.zeros(2 + spline(start).size)  # a, b, c
     some = np.flatnonzero(used)[:: -(-int(used.sum()) // MOST_PAIRED)]
     line[1::-1] = stats.theilslopes(depths[some], spline(seconds[some] - lag)[:, 0])[:2]
     variance = np.ones(len(depths))
     for round_ in range(15):
         inside = seen & _within(moments, seconds - lag)
         weights = np.where(used & inside, 1 / variance, 0)
-        design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), -speed(seconds - lag) @ line[1:]])
+        design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), trend, -speed(seconds - lag) @ line[1:-1]])
         missing = np.where(seen, depths, 0) - design[:, :-1] @ line
         root = np.sqrt(weights)
         step = np.linalg.lstsq(design * root[:, None], missing * root, rcond=None)[0]
         line, lag = line + step[:-1], lag + float(np.clip(step[-1], -0.05, 0.05))
-        predicted = line[0] + spline(seconds - lag) @ line[1:]
+        predicted = line[0] + spline(seconds - lag) @ line[1:-1] + trend * line[-1]
         residuals = np.where(inside, depths - predicted, np.nan)
-        rates = (speed(seconds - lag) @ line[1:]) ** 2
+        rates = (speed(seconds - lag) @ line[1:-1]) ** 2
         spread = NORMAL_MAD * np.nanmedian(np.abs(residuals))
         near = inside & (np.abs(residuals) < (8 * spread if round_ < 3 else GATE * np.sqrt(variance)))
         depth_variance, jitter = _two_variances(residuals[near], rates[near], spread)
@@ -259,7 +260,7 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
         if round_ > 4 and abs(step[-1]) < 1e-7:
             break
     _agree(predicted, depths, inside, used)
-    sigma = _sigma(design[used], residuals[used], 1 / variance[used])
+    sigma = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used])
     if abs(step[-1]) > sigma:
         found = f"it still moving by {1e3 * abs(step[-1]):.1f} ms a round, {lag:.3f} s at last"
         raise InputError(f"depths: expected the lag to settle near {start:.2f} s, found {found}")
@@ -290,9 +291,19 @@ def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float
     return float(depth), float(np.sqrt(time))
 
 
-def _sigma(design: Array, residuals: Array, weights: Array) -> float:
-    """Standard deviation of the lag by a sandwich estimate: from the residuals, each enlarged by its leverage."""
+def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array) -> float:
+    """Standard deviation of the lag from the residuals, each enlarged by its leverage: the larger of two sandwich estimates.
+
+    The one takes errors as independent, the other as alike within `ALIKE_S` (Newey and West 1987); tremor, whose errors change
+    sign from image to image, makes the second too small.
+    """
     inverse = np.linalg.pinv(design.T @ (design * weights[:, None]))
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
-    pulls = design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]
-    return float(np.sqrt((inverse @ (pulls.T @ pulls) @ inverse)[-1, -1]))
+    pulls = inverse[-1] @ (design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]).T
+    alone = alike = float(pulls @ pulls)
+    for k in range(1, len(pulls)):
+        near = np.maximum(1 - np.abs(seconds[k:] - seconds[:-k]) / ALIKE_S, 0)
+        if not near.any():
+            break
+        alike += 2 * float(pulls[k:] @ (near * pulls[:-k]))
+    return float(np.sqrt(max(alone, alike)))

@@ -108,6 +108,29 @@ def test_a_hand_that_tilts_moves_the_target_and_not_the_lag(rng):
     assert found.depth_sigma < 1.5
 
 
+@pytest.mark.parametrize("gives_mm", [-0.2, 0.2])
+def test_a_bracket_that_gives_moves_the_bottom_and_not_the_lag(rng, gives_mm):
+    """A trend of the depth by 0.2 mm over 5 s of an uneven motion alone looks like a lag of 0.43 ms."""
+    t = np.arange(0, 5, FRAME_S)
+    found = []
+    for given in (0.0, gives_mm):
+        depths = (60 - height(t) + given * t / 5) / bscans.MM_PER_PX
+        found.append(latency.estimate(nanoseconds(t + 0.05), depths, track_of(t, height(t))).seconds)
+    assert found[0] == pytest.approx(0.05, abs=1e-4)
+    assert found[1] == pytest.approx(found[0], abs=1e-4)
+
+
+def test_errors_that_neighbours_share_widen_the_interval(rng):
+    """Depths that wander within 0.2 s, as those of a spline or of a far tilt, by as much as independent ones."""
+    sigmas = []
+    for alike in (1, 5):
+        t = np.arange(0, 20, FRAME_S)
+        noise = np.repeat(rng.standard_normal(-(-len(t) // alike)), alike)[: len(t)]
+        depths = (60 - height(t)) / bscans.MM_PER_PX + DEPTH_NOISE_PX * noise
+        sigmas.append(latency.estimate(nanoseconds(t + 0.05), depths, track_of(t, height(t))).sigma_s)
+    assert sigmas[1] > 1.4 * sigmas[0]
+
+
 def refused(named, heights, depths, search_s=latency.SEARCH_S):
     t = np.arange(0, 20, FRAME_S)
     with pytest.raises(InputError, match=named) as raised:
