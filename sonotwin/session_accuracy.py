@@ -13,9 +13,11 @@ from tempfile import mkdtemp
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.board_part import read_board
 from recon.errors import InputError
 from recon.files.code_digest import code_digest, is_unchanged
 from recon.files.metrics import Metrics
+from recon.optical_calibration.known_length import length_of, longest
 from recon.probe_calibration import repeatability
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from recon.session import optics_step, plan, probe_step
@@ -23,6 +25,7 @@ from sonotwin import choices, config, rendered_session
 from sonotwin.choices import read_rig
 from sonotwin.rendered_session import BOTTOM, SCAN, TUBE, WATER_C, WATER_SIGMA_M_S, WIRES, Settings
 from sonotwin.verbs import reconstruct
+from twin.conditions import speeds
 from twin.evaluation import session_errors
 from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.kept_figures import Kept
@@ -32,6 +35,12 @@ Array = NDArray[np.float64]
 
 SEEDS = tuple(range(721, 731))
 BOARD_SCALE = {"ideal": 0.0, "lifelike": 3.0e-4}  # as a lab knows its board's print: exact, and of conf/conditions/lifelike.yaml
+USUAL, CERTIFIED = (
+    "usual",
+    "certified",
+)  # what a lab knows: the usual of its board and of tissue, or a length and the speed, measured
+KNOWN = {"ideal": (USUAL,), "lifelike": (USUAL, CERTIFIED)}
+LENGTH, SPEED_M_S = 2e-5, 5.0  # standard deviations of that length, relative, and of that speed
 RIG = "meza2021"
 POSES = "paper"  # of the board: 34, as in Meza et al. 2021
 LENGTHS = ("tube_diameter_error_mm", "cover_diameter_error_mm", "cover_wall_error_mm")  # of the cylinders
@@ -41,8 +50,8 @@ TISSUE_M_S = 1450.0  # of the phantom's silicone
 BOTTOM_HZ = 20.0  # pairs of frames over the flat bottom
 
 
-def sessions(setup: Setup, conditions: str, seeds: Sequence[int] = SEEDS) -> Figures:
-    """Figures over sessions under one kind of conditions.
+def sessions(setup: Setup, conditions: str, known: str = USUAL, seeds: Sequence[int] = SEEDS) -> Figures:
+    """Figures over sessions under one kind of conditions, by what the lab knows.
 
     Raises
     ------
@@ -51,7 +60,8 @@ def sessions(setup: Setup, conditions: str, seeds: Sequence[int] = SEEDS) -> Fig
     """
     if setup.rig != read_rig(RIG):
         raise InputError(f"accuracy: rig: expected {RIG} for only=session, found another")
-    return together([measured(setup.out, conditions, seed) for seed in seeds])
+    found, own = (measured(setup.out, conditions, seed) for seed in seeds), f"{known}_"
+    return together([{name.removeprefix(own): one[name] for name in one if name.startswith(own)} for one in found])
 
 
 def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
@@ -80,21 +90,30 @@ def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
 
 
 def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
-    """Render a session, take its truth away, reconstruct, and compare; then the cylinders by its calibrations.
+    """Render a session and the cylinders, take their truth away, reconstruct both by all that a lab may know, and compare.
 
-    Returns whether all steps were done, and the figures.
+    Returns whether all steps were done, and the figures, each with the name of what is known before its own.
     """
-    chosen = settings(conditions, seed)
-    for part in rendered_session.parts(chosen, work / "session", BOTTOM_HZ):
+    chosen, captures = settings(conditions, seed), {name: work / name / "session" for name in ("scan", "cylinders")}
+    for part in rendered_session.parts(chosen, captures["scan"], BOTTOM_HZ):
         part.run()
-    truth = (work / "session" / "truth").rename(work / "truth")
-    by = reconstruction(chosen, BOARD_SCALE[conditions], work / "session", work / "result")
-    status = reconstruct.run(by)
-    figures = session_errors.measure(work / "result", work / "session" / "capture", truth)
-    if status:
-        return False, figures
-    status, of_cylinders = cylinders(work / "cylinders", chosen, by)
-    return status == 0, figures | of_cylinders
+    for part in rendered_session.cylinders(chosen, captures["cylinders"]):
+        part.run()
+    truths = {name: (folder / "truth").rename(work / name / "truth") for name, folder in captures.items()}
+    whole, figures = True, {}
+    for known in KNOWN[conditions]:
+        by = reconstruction(chosen, BOARD_SCALE[conditions], captures["scan"], work / "scan" / known)
+        if known == CERTIFIED:
+            by = certified(by, chosen, truths["scan"])
+        status = reconstruct.run(by)
+        found = session_errors.measure(by.out, captures["scan"] / "capture", truths["scan"])
+        if status == 0:
+            in_tank = of_cylinders(by, captures["cylinders"], work / "cylinders" / known)
+            status = reconstruct.run(in_tank)
+            found |= {} if status else session_errors.cylinders(in_tank.out, truths["cylinders"], TUBE)
+        whole &= status == 0
+        figures |= {f"{known}_{name}": value for name, value in found.items()}
+    return whole, figures
 
 
 def settings(conditions: str, seed: int) -> Settings:
@@ -118,16 +137,27 @@ def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Pat
     )
 
 
-def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int, Metrics]:
-    """The paper's cylinders by the calibrations of a session; returns the exit status of `reconstruct`, and the figures."""
-    for part in rendered_session.cylinders(chosen, work / "session"):
-        part.run()
-    truth = (work / "session" / "truth").rename(work / "truth")
+def certified(by: reconstruct.Config, chosen: Settings, truth: Path) -> reconstruct.Config:
+    """The same by a lab that measured the longest line of its board's points, and the speed of sound in the tissue."""
+    assert by.capture is not None
+    rng, faster = np.random.default_rng([chosen.seed, 5]), speeds(chosen.conditions.sound, chosen.seed)[0]
+    length = length_of(np.load(truth / "board.npz")["points"], longest(read_board(by.capture).board.points()))
+    sigma = LENGTH * length
+    known = {
+        "board_length_mm": (length + sigma * rng.standard_normal(), sigma),
+        "tissue_m_s": TISSUE_M_S * faster + SPEED_M_S * rng.standard_normal(),
+        "tissue_sigma_m_s": SPEED_M_S,
+    }
+    return by.model_copy(update=known)
+
+
+def of_cylinders(by: reconstruct.Config, session: Path, out: Path) -> reconstruct.Config:
+    """Settings by which the paper's cylinders are reconstructed, by the calibrations of a session."""
     lag = plan.read_lag(by.out / "latency")
-    in_tank = reconstruct.Config(
-        rig=chosen.rig,
-        capture=work / "session" / "capture",
-        out=work / "result",
+    return reconstruct.Config(
+        rig=by.rig,
+        capture=session / "capture",
+        out=out,
         find="tube",
         calibration=by.out / "optics" / optics_step.OPTICS,
         probe=by.out / "probe" / probe_step.PROBE,
@@ -135,10 +165,7 @@ def cylinders(work: Path, chosen: Settings, by: reconstruct.Config) -> tuple[int
         lag_sigma_s=lag.sigma_s or 0.0,
         tissue_m_s=float(speed_of_sound(WATER_C)),
         tissue_sigma_m_s=WATER_SIGMA_M_S,
-        board_scale=by.board_scale,
     )
-    status = reconstruct.run(in_tank)
-    return status, {} if status else session_errors.cylinders(work / "result", truth, TUBE)
 
 
 def code() -> str:
@@ -159,6 +186,7 @@ def together(found: Sequence[Metrics]) -> Figures:
         "tracked_percent": 100 * np.min(tracked),
         "false_poses": np.sum([each(found, f"{film}_false") for film in films]),
         "shift_mm": each(found, f"{SCAN}_track_shift_median_mm").max(),
+        "shift_bound_mm": each(found, f"{SCAN}_track_shift_bound_mm").max(),
         "turn_deg": each(found, f"{SCAN}_track_turn_median_deg").max(),
         "latency_ms": np.abs(each(found, f"{SCAN}_lag_error_ms")).max(),
         "latency_covered_percent": 100 * each(found, f"{SCAN}_lag_covered").mean(),
@@ -174,7 +202,7 @@ def together(found: Sequence[Metrics]) -> Figures:
         figures |= {f"{name}_centre_mm": mm[0], f"{name}_corner_mm": mm[1:].max(), f"{name}_mean_mm": mm.mean()}
     for name in LENGTHS:
         errors = each(found, name)
-        figures |= {name: np.abs(errors).max(), f"{name}_mean": errors.mean()}
+        figures |= {name: np.abs(errors).max(), f"{name}_mean": errors.mean(), f"{name}_rms": rms(errors)}
         figures[f"{name}_spread"] = errors.std(ddof=1) if several else np.nan
     return figures | tumours(found)
 

@@ -10,7 +10,8 @@ from tests.twin.experiments import asked
 from twin.evaluation import session_errors
 from twin.experiments.experiment_setup import Setup
 
-FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "turn_median_deg": 0.04}
+FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "shift_bound_mm": 0.05,
+        "turn_median_deg": 0.04}  # fmt: skip
 SCAN = {
     "placement_over_sigma": 1.0,
     "lag_error_ms": -0.5, "lag_covered": 1.0, "probe_worst_error_mm": 0.1, "probe_worst_sigma_mm": 0.1, "contact_bias_mm": -0.02,
@@ -114,7 +115,7 @@ def test_figures_are_not_kept_of_code_that_was_edited_meanwhile(tmp_path, monkey
 def test_a_session_of_which_a_step_failed_misses_its_bars(rig):
     """What is missing is NaN, wherever in the list of sessions it stands."""
     for found in ([{}, figures()], [figures(), {}]):
-        assert {"latency", "probe, the worst of five pixels", "translation in the scan, median"} <= missed(found)
+        assert {"latency", "probe, the worst of five pixels", "rotation in the scan, median"} <= missed(found)
 
 
 def test_another_rig_is_refused(rig):

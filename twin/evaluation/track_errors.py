@@ -135,6 +135,8 @@ def measure(errors: Errors, expected: FilmTruth) -> Metrics:
         known = values[found]
         figures[f"track_{kind}_median_{unit}"] = float(np.median(known)) if known.size else np.nan
         figures[f"track_{kind}_p95_{unit}"] = float(np.quantile(known, 0.95)) if known.size else np.nan
+    bounds = errors.shift_bound_mm[np.isfinite(errors.shift_bound_mm)]
+    figures["track_shift_bound_mm"] = float(np.median(bounds)) if bounds.size else np.nan
     return figures
 
 
