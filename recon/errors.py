@@ -40,8 +40,14 @@ def one_line(error: ValidationError) -> str:
     field = ".".join(
         short(str(piece)) for piece in place if not re.match(r"\w+\[", str(piece))
     )  # `literal[...]`: a choice of several types
-    if kind in ("missing", "union_tag_not_found"):
+    if kind == "missing" and isinstance(place[-1], int):
+        text = "expected one more value, found none"
+    elif kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"
+    elif kind in ("too_long", "too_short"):
+        way, bound, count = ("at most", "max_length", "more") if kind == "too_long" else ("at least", "min_length", "fewer")
+        counted = first["ctx"]["actual_length"]
+        text = f"expected a length of {way} {first['ctx'][bound]}, found {count if counted is None else counted}"
     elif kind == "json_invalid":
         text = f"expected JSON, found damaged data: {first['ctx']['error']}"
     elif kind == "union_tag_invalid":

@@ -438,7 +438,7 @@ def describe(error: ValidationError, model: type[BaseModel]) -> str:
             above, types = _place(model, first["loc"][:-1])
             names = [name for one in types if _is_model(one) for name in one.model_fields]
             text = f"{field}: {_expected(way[-1], names, above)}"
-        case "missing":
+        case "missing" if not isinstance(first["loc"][-1], int):
             text = f"{field}: needs a value; give {field}=..."
         case _:
             text = re.sub(rf"^{re.escape('.'.join(map(str, first['loc'])))}(?=[.:])", lambda _: field, one_line(error))

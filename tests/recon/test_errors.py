@@ -22,6 +22,8 @@ FRINGES = {"kind": "fringes", "pitch": 12, "steps": 4}
         ({"parts": [FRINGES | {"phase": 1}]}, "parts.0.fringes.phase: expected no such field, found 1"),
         ({"parts": [FRINGES | {"pha\rse": 1}]}, "parts.0.fringes.pha se: expected no such field, found 1"),
         ({"parts": [{"kind": "centre_line"}]}, "parts: expected at least one set of fringes, found none"),
+        ({"projector_size": (128,)}, "projector_size.1: expected one more value, found none"),
+        ({"projector_size": (1, 2, 3)}, "projector_size: expected a length of at most 2, found 3"),
         ({"unwrap": "guess"}, "unwrap: expected 'centre_line', 'gray' or 'heterodyne', found 'guess'"),
     ],
 )  # fmt: skip
