@@ -35,7 +35,8 @@ class Regions:
 def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]) -> Regions:
     """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
 
-    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes.
+    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes. They are joined
+    last: a bust before a table goes on to it on one side only, and the tear on the other would count against what lies behind.
 
     Parameters
     ----------
@@ -62,11 +63,14 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
         torn[q][p] += n
 
     def proposal(p: int, q: int) -> tuple[float, int] | None:
-        """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be."""
+        """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be.
+
+        Of two with the line it is below 0, so that these come last.
+        """
         offsets = links[p][q]
         if p in anchored and q in anchored:
             k = anchored[q] - anchored[p]
-            return (offsets[k], k) if offsets[k] else None
+            return (-1 / offsets[k], k) if offsets[k] else None
         k, n = offsets.most_common(1)[0]
         share = n / (offsets.total() + torn[p][q])
         return (n * share, k) if share >= CONTINUOUS else None
