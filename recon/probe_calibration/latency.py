@@ -1,11 +1,12 @@
 """Time calibration: the lag of the scanner's images behind the poses, from an up-and-down motion over a flat bottom.
 
-The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t` with six coordinates x of its pose. Above
-all it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the one by a
-millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated probe. The
-trend c is of a bracket that gives: by 0.1 mm over an uneven motion it would look like a lag of 2 ms. Both streams have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at
-the moment of each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other
-by 50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
+The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t` with six coordinates x of its pose.
+Above all it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the
+one by a millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated
+probe. The trend c is of a bracket that gives: by 0.1 mm over an uneven motion it would look like a lag of 2 ms. Both streams
+have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at the
+moment of each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other by
+50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
 
 Move the probe by 10 mm or more, three times or more, at an uneven pace: a periodic motion fits at more than one lag.
 """
