@@ -172,13 +172,14 @@ def _equations(rows: DeviceRows, target: Target, known: Uncertainty, names: Sequ
 def agreeing(rows: DeviceRows, target: Target, known: Uncertainty, names: Sequence[str], each: int) -> DeviceRows:
     """Groups of `each` equations that agree with most others, whatever has moved: edges and stray light are left out.
 
-    First by the residuals as they are: errors free to explain all of them would bend to the worst.
+    First by the residuals as they are: errors free to explain all of them would bend to the worst. Each equation of a group is
+    judged by its like, since a part that moved shows in some of them alone.
     """
     equations = _equations(rows, target, known, names)
     left, used = equations.residuals, np.ones(len(rows.residuals) // each, bool)
     for _ in range(1 + TRIMS):
-        worst = np.abs(left.reshape(-1, each)).max(axis=1)
-        used = worst < OUTLYING * max(NORMAL_MAD * float(np.median(np.abs(left))), 1e-12)
+        groups = np.abs(left.reshape(-1, each))
+        used = (groups < OUTLYING * np.maximum(NORMAL_MAD * np.median(groups, axis=0), 1e-12)).all(axis=1)
         left = fault_tests.unexplained(equations, np.repeat(used, each))
     return DeviceRows(*(part[np.repeat(used, each)] for part in rows))
 

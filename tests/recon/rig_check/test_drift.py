@@ -139,3 +139,15 @@ def test_points_that_are_far_off_are_left_out_though_motions_bend_to_them(rig, r
     rows = DeviceRows(rng.standard_normal(1000) + 2000.0 * wrong, slopes, np.zeros((1000, len(rig.target.LENGTHS))))
     left = optics_equations.agreeing(rows, rig.target, Uncertainty(names, 1e-8 * np.eye(len(names))), names, 1)
     assert np.abs(left.residuals).max() < 100 and len(left.residuals) > 0.98 * np.count_nonzero(~wrong)
+
+
+def test_fringes_along_both_axes_count_though_a_camera_has_turned(rig, calibration, rng):
+    """By 0.02 deg: one of three equations of a point is off by 100 standard deviations, of nearly all points alike."""
+    names = optics_equations.parameters(drift.usual_drift(calibration.cameras, DRIFT_PX), list(calibration.cameras))
+    known = drift.usual_drift(calibration.cameras, DRIFT_PX)
+    for _ in range(8):
+        true = drawn_check.turned(calibration.cameras, rng, "cam2", 0.02)
+        matches = drawn_check.drawn_matches(true, calibration.cameras, (0, 1), SIGMA_PX, rng).some(slice(0, 300))
+        rows = optics_equations.of_fringes(matches, calibration.cameras, rig.target, names)
+        left = optics_equations.agreeing(rows, rig.target, known, names, 3)
+        assert len(left.residuals) > 0.9 * len(rows.residuals)
