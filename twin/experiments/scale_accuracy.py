@@ -137,7 +137,7 @@ def _scale(result: Result, seen: BoardSet) -> tuple[float, float]:
     pair = devices_that_measure(found)
     size = float(np.ptp(result.observations.points, axis=0).max()) / SIDE_MM
     volume = uncertainty.working_volume(seen.truth, [size * depth for depth in DEPTHS])
-    modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
+    modes = uncertainty.similarity_modes(volume)
     errors = point_errors(found, seen.truth, pair, volume)
     error = np.linalg.lstsq(modes.reshape(-1, 7), errors.ravel(), rcond=None)[0][-1]
     return float(error), uncertainty.scale(found, *pair, volume)

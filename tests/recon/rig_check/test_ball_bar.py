@@ -125,6 +125,6 @@ def test_a_bar_tells_the_scale_as_well_as_it_says(rig, calibration):
         sigma = uncertainty.scale(found, "cam1", "cam2", volume)
         assert sigma < 8e-5
         places = meet([found.cameras[name] for name in CAMERAS], [true[name].project(volume) for name in CAMERAS])[0]
-        modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
+        modes = uncertainty.similarity_modes(volume)
         normal.append(np.linalg.lstsq(modes.reshape(-1, 7), (places - volume).ravel(), rcond=None)[0][-1] / sigma)
     assert abs(np.mean(np.square(normal)) - 1) < 3 * np.sqrt(2 / 24)

@@ -123,7 +123,7 @@ def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
         assert sigma < 8e-5
         seen = [true[name].project(volume) for name in ("cam1", "cam2")]
         places = meet([found.cameras[name] for name in ("cam1", "cam2")], seen)[0]
-        modes = np.concatenate([uncertainty.rigid_modes(volume), (volume - volume.mean(axis=0))[..., None]], axis=-1)
+        modes = uncertainty.similarity_modes(volume)
         normal.append(np.linalg.lstsq(modes.reshape(-1, 7), (places - volume).ravel(), rcond=None)[0][-1] / sigma)
     assert abs(np.mean(np.square(normal)) - 1) < 4 * np.sqrt(2 / 10)
     by_cameras = drift.estimate(calibration, film, None, drift_step.with_open_scale(target), 3e-4, DRIFT_PX).after
