@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONTINUOUS = 0.85  # share of the common border of two basins that must be continuous for them to be one region
+MOSTLY = 0.5  # likewise, where one basin of the one borders on one of the other like that, and all that is continuous agrees
 VOTES = 5  # least rows with the line on a region
 AGREEMENT = 0.85  # least share of the votes for one order
 
@@ -35,8 +36,8 @@ class Regions:
 def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]) -> Regions:
     """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
 
-    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes. They are joined
-    last: a bust before a table goes on to it on one side only, and the tear on the other would count against what lies behind.
+    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes. A bust before a table
+    is joined to it so, and torn off what lies behind; the table goes on around it: half of such a border is enough.
 
     Parameters
     ----------
@@ -61,19 +62,20 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
     for (p, q), n in borders.torn.items():
         torn[p][q] += n
         torn[q][p] += n
+    whole: dict[int, set[int]] = defaultdict(set)  # neighbours by a border that is continuous
+    for p, its in links.items():
+        whole[p] = {q for q, offsets in its.items() if max(offsets.values()) >= CONTINUOUS * (offsets.total() + torn[p][q])}
 
     def proposal(p: int, q: int) -> tuple[float, int] | None:
-        """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be.
-
-        Of two with the line it is below 0, so that these come last.
-        """
+        """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be."""
         offsets = links[p][q]
         if p in anchored and q in anchored:
             k = anchored[q] - anchored[p]
-            return (-1 / offsets[k], k) if offsets[k] else None
+            return (offsets[k], k) if offsets[k] else None
         k, n = offsets.most_common(1)[0]
         share = n / (offsets.total() + torn[p][q])
-        return (n * share, k) if share >= CONTINUOUS else None
+        least = MOSTLY if q in whole[p] and n >= AGREEMENT * offsets.total() else CONTINUOUS
+        return (n * share, k) if share >= least else None
 
     age = [0] * count
     queue: list[tuple[float, int, int, int]] = []
@@ -98,6 +100,9 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
         if q in anchored:
             anchored.setdefault(p, anchored.pop(q) - k)
         del links[p][q], links[q][p]
+        for other in whole.pop(q, set()) - {p}:
+            whole[p].add(other)
+            whole[other].add(p)
         for other, n in torn.pop(q, Counter()).items():
             torn[p][other] += n
             torn[other][p] += n

@@ -27,6 +27,13 @@ def test_what_lies_behind_a_bust_joins_by_its_far_end():
     assert [found.absolute[name] + int(lift) for lift in found.lift] == [-23, 6, 11, 19]
 
 
+@pytest.mark.parametrize("off_b", [(1, 1, 300), (0, 25, 0), (1, 0, 300)])
+def test_an_opening_in_a_torn_border_joins_nothing(off_b):
+    """A wall with the line in two basins (a, b) of the same order, and an object (c) that meets one of them by chance."""
+    found = join(3, borders(ab=(0, 200, 0), ac=(1, 30, 0), bc=off_b), {0: Counter({0: 100}), 1: Counter({0: 100})}, set())
+    assert found.region[0] == found.region[1] != found.region[2]
+
+
 @pytest.mark.parametrize(("whole", "torn", "joined"), [(90, 10, True), (80, 20, False)])
 def test_a_torn_border_joins_nothing(whole, torn, joined):
     found = join(2, borders(ab=(3, whole, torn)), {0: Counter({7: 50})}, set())
