@@ -45,9 +45,8 @@ def one_line(error: ValidationError) -> str:
     elif kind in ("missing", "union_tag_not_found"):
         text = "expected a value, found none"
     elif kind in ("too_long", "too_short"):
-        way, bound, count = ("at most", "max_length", "more") if kind == "too_long" else ("at least", "min_length", "fewer")
-        counted = first["ctx"]["actual_length"]
-        text = f"expected a length of {way} {first['ctx'][bound]}, found {count if counted is None else counted}"
+        way, bound = ("at most", "max_length") if kind == "too_long" else ("at least", "min_length")
+        text = f"expected a length of {way} {first['ctx'][bound]}, found {first['ctx']['actual_length']}"
     elif kind == "json_invalid":
         text = f"expected JSON, found damaged data: {first['ctx']['error']}"
     elif kind == "union_tag_invalid":

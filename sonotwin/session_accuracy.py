@@ -35,12 +35,10 @@ Array = NDArray[np.float64]
 
 SEEDS = tuple(range(721, 731))
 BOARD_SCALE = {"ideal": 0.0, "lifelike": 3.0e-4}  # as a lab knows its board's print: exact, and of conf/conditions/lifelike.yaml
-USUAL, CERTIFIED = (
-    "usual",
-    "certified",
-)  # what a lab knows: the usual of its board and of tissue, or a length and the speed, measured
+USUAL = "usual"  # a lab knows its board and tissue as they usually are
+CERTIFIED = "certified"  # it had a length of its board measured, and the tissue's speed of sound
 KNOWN = {"ideal": (USUAL,), "lifelike": (USUAL, CERTIFIED)}
-LENGTH, SPEED_M_S = 2e-5, 5.0  # standard deviations of that length, relative, and of that speed
+LENGTH_SIGMA, SPEED_SIGMA_M_S = 2e-5, 5.0  # standard deviations of that length, relative, and of that speed
 RIG = "meza2021"
 POSES = "paper"  # of the board: 34, as in Meza et al. 2021
 LENGTHS = ("tube_diameter_error_mm", "cover_diameter_error_mm", "cover_wall_error_mm")  # of the cylinders
@@ -56,11 +54,17 @@ def sessions(setup: Setup, conditions: str, known: str = USUAL, seeds: Sequence[
     Raises
     ------
     InputError
-        For another rig than the default one: sessions are rendered by verbs, which read theirs from conf/rig.
+        For another rig than the default one: sessions are rendered by verbs, which read theirs from conf/rig; or where sessions
+        of such conditions aren't reconstructed by what is `known`.
     """
     if setup.rig != read_rig(RIG):
         raise InputError(f"accuracy: rig: expected {RIG} for only=session, found another")
-    found, own = (measured(setup.out, conditions, seed) for seed in seeds), f"{known}_"
+    if known not in KNOWN[conditions]:
+        raise InputError(
+            f"accuracy: known: expected one of {', '.join(KNOWN[conditions])} of {conditions} sessions, found {known}"
+        )
+    own = f"{known}_"
+    found = [measured(setup.out, conditions, seed) for seed in seeds]
     return together([{name.removeprefix(own): one[name] for name in one if name.startswith(own)} for one in found])
 
 
@@ -139,16 +143,15 @@ def reconstruction(chosen: Settings, board_scale: float, session: Path, out: Pat
 
 def certified(by: reconstruct.Config, chosen: Settings, truth: Path) -> reconstruct.Config:
     """The same by a lab that measured the longest line of its board's points, and the speed of sound in the tissue."""
-    assert by.capture is not None
     rng, faster = np.random.default_rng([chosen.seed, 5]), speeds(chosen.conditions.sound, chosen.seed)[0]
     length = length_of(np.load(truth / "board.npz")["points"], longest(read_board(by.capture).board.points()))
-    sigma = LENGTH * length
+    sigma = LENGTH_SIGMA * length
     known = {
         "board_length_mm": (length + sigma * rng.standard_normal(), sigma),
-        "tissue_m_s": TISSUE_M_S * faster + SPEED_M_S * rng.standard_normal(),
-        "tissue_sigma_m_s": SPEED_M_S,
+        "tissue_m_s": TISSUE_M_S * faster + SPEED_SIGMA_M_S * rng.standard_normal(),
+        "tissue_sigma_m_s": SPEED_SIGMA_M_S,
     }
-    return by.model_copy(update=known)
+    return reconstruct.Config.model_validate(dict(by) | known)
 
 
 def of_cylinders(by: reconstruct.Config, session: Path, out: Path) -> reconstruct.Config:
@@ -186,7 +189,7 @@ def together(found: Sequence[Metrics]) -> Figures:
         "tracked_percent": 100 * np.min(tracked),
         "false_poses": np.sum([each(found, f"{film}_false") for film in films]),
         "shift_mm": each(found, f"{SCAN}_track_shift_median_mm").max(),
-        "shift_bound_mm": each(found, f"{SCAN}_track_shift_bound_mm").max(),
+        "shift_expected_mm": np.median(each(found, f"{SCAN}_track_shift_expected_mm")),
         "turn_deg": each(found, f"{SCAN}_track_turn_median_deg").max(),
         "latency_ms": np.abs(each(found, f"{SCAN}_lag_error_ms")).max(),
         "latency_covered_percent": 100 * each(found, f"{SCAN}_lag_covered").mean(),

@@ -3,10 +3,10 @@
 The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t` with six coordinates x of its pose.
 Above all it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the
 one by a millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated
-probe. The trend c is of a bracket that gives: by 0.1 mm over an uneven motion it would look like a lag of 2 ms. Both streams
-have time stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at the
-moment of each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other by
-50 ppm it changes by 3 ms a minute, so calibrate anew for long sessions.
+probe. The trend c, of 0.2 mm or so, is of a bracket that gives, which would look like a lag of 2 ms. Both streams have time
+stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at the moment of
+each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other by 50 ppm it
+changes by 3 ms a minute, so calibrate anew for long sessions.
 
 Move the probe by 10 mm or more, three times or more, at an uneven pace: a periodic motion fits at more than one lag.
 """
@@ -42,8 +42,10 @@ RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion
 VALLEY = 0.8  # correlation between two such lags, over the best, that separates them
 MOST_PAIRED = 1000  # images by whose pairs the fit begins
 GATE = 4.0  # normalised residual of an outlier
-ALIKE_S = 0.3  # within which errors go together: the spline's, and those of a hand that tilts far
+ALIKE_S = 0.3  # within which errors go together: those of the spline, at least
+GIVES_MM = 0.2  # standard deviation of a bracket's giving over the sweep: one stroke alone doesn't tell it from a lag
 COVERAGE = 0.95  # of the interval
+FAR_MM = 1.0  # of a trend, that no bracket gives
 BLOCK_PX = 8  # columns taken together
 BOTTOM_SIGMA_PX = 1.5  # smoothing in depth
 BOTTOM_CONTRAST = 30.0  # grey levels above the median of its columns
@@ -62,6 +64,7 @@ class Lag:
     depth_sigma: float  # the constant part, in units of the depths
     used: NDArray[np.bool_]  # (n,) images: with a pose and a depth, and no outlier
     residuals: Array  # (n,) in units of the depths; NaN without a pose or a depth
+    trend_mm: float  # by which the bottom rose or sank against the probe over the sweep, as motions along the first direction are
 
 
 def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tuple[float, float] = SEARCH_S) -> Lag:
@@ -108,6 +111,7 @@ def measure(depths: Array, found: Lag) -> Metrics:
         "lag_high_ms": 1e3 * found.interval_s[1],
         "jitter_ms": 1e3 * found.jitter_s,
         "depth_sigma_px": found.depth_sigma,
+        "trend_mm": found.trend_mm,
     }
 
 
@@ -245,8 +249,10 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
         weights = np.where(used & inside, 1 / variance, 0)
         design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), trend, -speed(seconds - lag) @ line[1:-1]])
         missing = np.where(seen, depths, 0) - design[:, :-1] @ line
-        root = np.sqrt(weights)
-        step = np.linalg.lstsq(design * root[:, None], missing * root, rcond=None)[0]
+        root, held = np.sqrt(weights), np.zeros(design.shape[1])
+        held[-2] = np.ptp(seconds) / (GIVES_MM * max(abs(line[1]), 1e-9))
+        equations = np.vstack([design * root[:, None], held]), np.append(missing * root, -held[-2] * line[-1])
+        step = np.linalg.lstsq(*equations, rcond=None)[0]
         line, lag = line + step[:-1], lag + float(np.clip(step[-1], -0.05, 0.05))
         predicted = line[0] + spline(seconds - lag) @ line[1:-1] + trend * line[-1]
         residuals = np.where(inside, depths - predicted, np.nan)
@@ -260,15 +266,16 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
             raise InputError(f"depths: expected at least {MIN_FRAMES} images that agree on a lag, found {used.sum()}")
         if round_ > 4 and abs(step[-1]) < 1e-7:
             break
-    _agree(predicted, depths, inside, used)
-    sigma = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used])
+    _agree(predicted - trend * line[-1], depths - trend * line[-1], inside, used)
+    sigma = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used], held)
     if abs(step[-1]) > sigma:
         found = f"it still moving by {1e3 * abs(step[-1]):.1f} ms a round, {lag:.3f} s at last"
         raise InputError(f"depths: expected the lag to settle near {start:.2f} s, found {found}")
     if not search_s[0] <= lag <= search_s[1]:
         raise InputError(f"search_s: expected the lag within {search_s[0]:g} to {search_s[1]:g} s, found {lag:.3f} s")
     reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - design.shape[1])) * sigma
-    return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals)
+    gives = float(line[-1] * np.ptp(seconds) / abs(line[1]))
+    return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals, gives)
 
 
 def _agree(predicted: Array, depths: Array, inside: NDArray[np.bool_], used: NDArray[np.bool_]) -> None:
@@ -292,13 +299,13 @@ def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float
     return float(depth), float(np.sqrt(time))
 
 
-def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array) -> float:
+def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held: Array) -> float:
     """Standard deviation of the lag from the residuals, each enlarged by its leverage: the larger of two sandwich estimates.
 
     The one takes errors as independent, the other as alike within `ALIKE_S` (Newey and West 1987); tremor, whose errors change
-    sign from image to image, makes the second too small.
+    sign from image to image, makes the second too small. To both is added what the trend's own size leaves open, as `held`.
     """
-    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]))
+    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]) + np.outer(held, held))
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
     pulls = inverse[-1] @ (design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]).T
     alone = alike = float(pulls @ pulls)
@@ -307,4 +314,4 @@ def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array) -> f
         if not near.any():
             break
         alike += 2 * float(pulls[k:] @ (near * pulls[:-k]))
-    return float(np.sqrt(max(alone, alike)))
+    return float(np.sqrt(max(alone, alike) + (inverse[-1] @ held) ** 2))

@@ -131,6 +131,9 @@ def measure(sweep: Sweep, settings: Method | None = None, watch: Watch = SILENT)
         raise InputError(f"{sweep.name}: {error}") from None
     if line := scan_checks.frozen(sweep.images(), sweep.poses(lag.seconds)):
         log.warning("%s: %s", sweep.name, line)
+    if abs(lag.trend_mm) > latency.FAR_MM:
+        cause = "a bracket that slips, or a bottom that isn't level and still?"
+        log.warning("%s: the bottom moved by %+.1f mm against the probe during the sweep: %s", sweep.name, lag.trend_mm, cause)
     figures = latency.measure(depths, lag) | {"seconds_find": round(seconds, 3)}
     for line in describe(figures):
         watch.say(line)

@@ -55,10 +55,12 @@ def height(t):
     return 9 * np.sin(2 * np.pi * (0.6 * t + 0.25 * np.sin(0.9 * t))) + 3 * np.sin(2.4 * t + 1)
 
 
-def bottom(folder: Path, rng, lag_s: float) -> Path:
-    """Six seconds over a flat bottom at 15 frames/s, tracked at 40 poses/s."""
+def bottom(folder: Path, rng, lag_s: float, slips_mm: float = 0.0) -> Path:
+    """Six seconds over a flat bottom at 15 frames/s, tracked at 40 poses/s; the target may slip along the probe meanwhile."""
     shown, tracked = np.arange(0.3, 6, 1 / 15), np.arange(0, 6.3, 1 / 40)
-    poses = np.array([rigid.transform(np.eye(3), [5, -3, 700 - h]) for h in height(tracked)])
+    poses = np.array(
+        [rigid.transform(np.eye(3), [5, -3, 700 - h - slips_mm * t / 6]) for t, h in zip(tracked, height(tracked), strict=True)]
+    )
     poses[50:53] = np.nan
     images = (bscans.image(bscans.bottom((32 + h) / bscans.MM_PER_PX) + bscans.face(), rng) for h in height(shown))
     times = nanoseconds(shown + lag_s)

@@ -24,6 +24,7 @@ FRINGES = {"kind": "fringes", "pitch": 12, "steps": 4}
         ({"parts": [{"kind": "centre_line"}]}, "parts: expected at least one set of fringes, found none"),
         ({"projector_size": (128,)}, "projector_size.1: expected one more value, found none"),
         ({"projector_size": (1, 2, 3)}, "projector_size: expected a length of at most 2, found 3"),
+        ({"parts": []}, "parts: expected a length of at least 1, found 0"),
         ({"unwrap": "guess"}, "unwrap: expected 'centre_line', 'gray' or 'heterodyne', found 'guess'"),
     ],
 )  # fmt: skip

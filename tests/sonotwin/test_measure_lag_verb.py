@@ -36,6 +36,14 @@ def test_the_lag_is_found_and_said(capture, tmp_path, capsys):
     assert len(depths) == 86 and 150 < np.ptp(depths) < 200, "18 to 24 mm of 0.1225 mm/px"
 
 
+def test_a_target_that_slips_far_is_said(tmp_path, caplog):
+    """By 3 mm during the sweep: the lag is found all the same, and a usual bracket isn't what gave."""
+    capture = sweep_sets.bottom(tmp_path / "capture", np.random.default_rng(0), LAG_S, slips_mm=3.0)
+    assert main(["measure-lag", f"capture={capture}", f"out={tmp_path / 'lag'}"]) == 0
+    assert "the bottom moved by -2.8 mm against the probe during the sweep: a bracket that slips" in caplog.text
+    assert json.loads((tmp_path / "lag" / "lag.json").read_text())["lag_s"] == pytest.approx(LAG_S, abs=0.002)
+
+
 def test_a_sequence_of_plus_tells_its_own_lag(capture, tmp_path):
     """Poses at the images' stamps, 15 a second, so less sure: by its own interval, of some ms. The screen's text is no bottom."""
     path = sweep_sets.recorded(tmp_path / "bottom.igs.mha", capture, screen=True)

@@ -1,5 +1,7 @@
 """Rows of whole sessions: the worst counts, a mass that is missed fails, and what was measured is kept."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,11 @@ from recon.errors import InputError
 from scenes.catalogue import build_scene
 from sonotwin import rendered_session, session_accuracy
 from tests.twin.experiments import asked
+from twin.conditions import speeds
 from twin.evaluation import session_errors
 from twin.experiments.experiment_setup import Setup
 
-FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "shift_bound_mm": 0.05,
+FILM = {"frames": 100, "visible": 95, "visible_found": 95, "false": 0, "shift_median_mm": 0.02, "shift_expected_mm": 0.05,
         "turn_median_deg": 0.04}  # fmt: skip
 SCAN = {
     "placement_over_sigma": 1.0,
@@ -22,6 +25,9 @@ TUMOUR = {
     "true_extent_mm": 20.0, "centre_error_mm": 0.2, "volume_mm3": 1030.0, "true_volume_mm3": 1000.0, "under_skin_mm": 8.1,
     "true_under_skin_mm": 8.0, "inside": 1, "centre_sigma_mm": 0.3, "volume_sigma_mm3": 30.0, "depth_sigma_mm": 0.2,
 }  # fmt: skip
+
+
+TRANSLATION = "translation in the scan, median (limit: that of one session as its covariance predicts it)"
 
 
 def figures(**changes) -> dict:
@@ -115,7 +121,39 @@ def test_figures_are_not_kept_of_code_that_was_edited_meanwhile(tmp_path, monkey
 def test_a_session_of_which_a_step_failed_misses_its_bars(rig):
     """What is missing is NaN, wherever in the list of sessions it stands."""
     for found in ([{}, figures()], [figures(), {}]):
-        assert {"latency", "probe, the worst of five pixels", "rotation in the scan, median"} <= missed(found)
+        assert {"latency", "probe, the worst of five pixels", TRANSLATION} <= missed(found)
+
+
+def test_rows_are_of_what_the_lab_knew(rig, monkeypatch):
+    """A session's figures are kept by what was known, and a row takes its own; none of what no session was reconstructed by."""
+    monkeypatch.setattr(session_accuracy, "read_rig", lambda name: rig)
+    known = {"usual": figures(scan_track_shift_median_mm=0.3), "certified": figures(scan_track_shift_median_mm=0.05)}
+    kept = {f"{name}_{key}": value for name, one in known.items() for key, value in one.items()}
+    monkeypatch.setattr(session_accuracy, "measured", lambda out, conditions, seed: kept)
+    for name, shift in (("usual", 0.3), ("certified", 0.05)):
+        found = session_accuracy.sessions(Setup(rig), "lifelike", name)
+        assert found["shift_mm"] == shift and found["sessions"] == len(session_accuracy.SEEDS)
+    assert asked.missed(session_accuracy.sessions, found, conditions="lifelike", known="certified") == []
+    with pytest.raises(InputError, match="known: expected one of usual of ideal sessions, found certified"):
+        session_accuracy.sessions(Setup(rig), "ideal", "certified")
+
+
+def test_a_lab_measures_its_own_board_and_tissue(tmp_path, monkeypatch):
+    """The length of the printed board, not of its design, and the tissue's own speed: both within 5 sigma."""
+    chosen, design = (
+        session_accuracy.settings("lifelike", 3),
+        np.stack([np.arange(12.0) % 4, np.arange(12.0) // 4, 0 * np.arange(12)], 1),
+    )
+    monkeypatch.setattr(
+        session_accuracy, "read_board", lambda folder: SimpleNamespace(board=SimpleNamespace(points=lambda: design))
+    )
+    np.savez(tmp_path / "board.npz", points=1.0005 * design)
+    by = session_accuracy.reconstruction(chosen, 3e-4, tmp_path, tmp_path / "out")
+    found = session_accuracy.certified(by, chosen, tmp_path)
+    length, sigma = found.board_length_mm
+    assert sigma == pytest.approx(3.0015 * 2e-5) and abs(length - 3.0015) < 5 * sigma
+    true = 1450.0 * speeds(chosen.conditions.sound, 3)[0]
+    assert abs(found.tissue_m_s - true) < 5 * found.tissue_sigma_m_s == 25.0
 
 
 def test_another_rig_is_refused(rig):

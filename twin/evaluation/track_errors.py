@@ -42,6 +42,7 @@ class Errors:
     turn_deg: Array  # (n,)
     shift_bound_mm: Array  # (n,) which LEVEL of the errors should keep to, by the predicted covariance
     turn_bound_deg: Array  # (n,)
+    shift_expected_mm: Array  # (n,) median of such errors, by the predicted covariance
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -91,14 +92,15 @@ def compare(track: Track, expected: FilmTruth) -> Errors:
     """Errors of a track, frame by frame, with those that its covariance predicts."""
     count = len(expected.times)
     shift, turn = np.full((2, count), np.nan)
-    bounds = np.full((2, count), np.nan)
+    bounds, expected_mm = np.full((2, count), np.nan), np.full(count, np.nan)
     for k in np.flatnonzero(track.found):
         error = rigid.difference(expected.poses[k], track.poses[k])
         turn[k], shift[k] = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
         if track.covariance is not None:
             total = track.covariance[k] if track.shared is None else track.covariance[k] + track.shared[k]
             bounds[:, k] = length_bound(total[3:, 3:]), length_bound(total[:3, :3])
-    return Errors(shift, np.rad2deg(turn), bounds[0], np.rad2deg(bounds[1]))
+            expected_mm[k] = length_bound(total[3:, 3:], 0.5)
+    return Errors(shift, np.rad2deg(turn), bounds[0], np.rad2deg(bounds[1]), expected_mm)
 
 
 def length_bound(covariance: Array, level: float = LEVEL) -> float:
@@ -135,8 +137,8 @@ def measure(errors: Errors, expected: FilmTruth) -> Metrics:
         known = values[found]
         figures[f"track_{kind}_median_{unit}"] = float(np.median(known)) if known.size else np.nan
         figures[f"track_{kind}_p95_{unit}"] = float(np.quantile(known, 0.95)) if known.size else np.nan
-    bounds = errors.shift_bound_mm[np.isfinite(errors.shift_bound_mm)]
-    figures["track_shift_bound_mm"] = float(np.median(bounds)) if bounds.size else np.nan
+    predicted = errors.shift_expected_mm[np.isfinite(errors.shift_expected_mm)]
+    figures["track_shift_expected_mm"] = float(np.median(predicted)) if predicted.size else np.nan
     return figures
 
 

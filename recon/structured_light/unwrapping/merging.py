@@ -36,8 +36,8 @@ class Regions:
 def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]) -> Regions:
     """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
 
-    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes. A bust before a table
-    is joined to it so, and torn off what lies behind; the table goes on around it: half of such a border is enough.
+    Two basins with the line need no continuous border, only one contact that doesn't contradict their votes. A bust before a
+    table is joined to it so, and torn off what lies behind; the table goes on around it: half of such a border is enough.
 
     Parameters
     ----------

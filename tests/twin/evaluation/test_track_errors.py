@@ -42,6 +42,7 @@ def test_errors_are_those_that_were_made(rng):
     assert np.sqrt(np.nanmean(errors.turn_deg**2)) == pytest.approx(np.rad2deg(np.linalg.norm(sigma[:3])), rel=0.1)
     figures = measure(errors, expected)
     assert figures["track_within_bound"] == pytest.approx(0.95, abs=0.03)
+    assert figures["track_shift_median_mm"] == pytest.approx(figures["track_shift_expected_mm"], rel=0.15)
     assert (figures["track_found"], figures["track_visible"], figures["track_visible_found"]) == (399, 400, 399)
     assert figures["track_false"] == 0 and figures["track_blur_most_px"] == 4
 
