@@ -27,7 +27,7 @@ TUMOUR = {
 }  # fmt: skip
 
 
-TRANSLATION = "translation in the scan, median (limit: that of one session as its covariance predicts it)"
+TRANSLATION = "translation in the scan, median"
 
 
 def figures(**changes) -> dict:
