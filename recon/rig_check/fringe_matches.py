@@ -22,7 +22,8 @@ LEAST = 30
 HALF = 3  # px of a window, to each side of its middle
 CANDIDATES = 20  # pixels tried, for one that is used
 FLAT_PX = 0.5  # projector px from a window's plane: beyond, an edge runs through it
-FLOOR_PX = 0.003  # projector px: errors of a map that a window's pixels share, on rendered skin; a sensor's noise isn't shared
+FLOOR_PX = 0.01  # projector px: errors of a map that a window's pixels share
+SHARED = 9  # pixels of a window whose errors go together: the optics' blur
 
 
 def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera], rng: np.random.Generator, name: str) -> Matches:
@@ -79,5 +80,5 @@ def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) ->
         claimed = np.sqrt(np.mean(left**2, axis=1)) if sigma is None else sigma[rows, columns].mean(axis=1)
         values.append(np.where(flat, value, np.nan))
         gradients.append(plane[:, 1:])
-        noises.append(np.hypot(FLOOR_PX, claimed / np.sqrt(len(across))))
+        noises.append(np.hypot(FLOOR_PX, claimed * np.sqrt(SHARED / len(across))))
     return np.stack(values, axis=1), np.stack(gradients, axis=1), np.stack(noises, axis=1)

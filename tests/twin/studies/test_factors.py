@@ -53,7 +53,7 @@ def test_whole_ranges_are_numbers_without_fractions():
         ({"from": 2, "to": 2}, "expected from below to, found 2 and 2"),
         ({"from": 5, "to": -1, "whole": True}, "expected from below to, found 5 and -1"),
         ({"normal": [1, 0]}, "normal.1: expected greater than 0, found 0"),
-        ({"normal": [1]}, "normal.1: expected a value"),
+        ({"normal": [1]}, "normal.1: expected one more value"),
         ({"normal": [1, 2], "log": True}, "log: expected no such field"),
     ],
 )
