@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 MOST = 1000  # points: fewer hardly show a shift of the projector, whose parallax lies below a point's noise
 LEAST = 30
 HALF = 3  # px of a window, to each side of its middle
-CANDIDATES = 20  # pixels tried, for one that is used
+CANDIDATES = 20  # windows tried, for one that is used
 FLAT_PX = 0.5  # projector px from a window's plane: beyond, an edge runs through it
 FLOOR_PX = 0.01  # projector px: errors of a map that a window's pixels share
 SHARED = 9  # pixels of a window whose errors go together: the optics' blur
@@ -43,10 +43,8 @@ def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera]
     if not axes:
         raise InputError(f"{name}: expected both cameras' images of one sequence, found no axis of the projector in both")
     values, sigmas = ([[camera[k][part] for k in axes] for camera in layers] for part in (0, 1))
-    seen = np.isfinite(values[0]).all(axis=0)
-    inner = np.flatnonzero(seen.ravel())
-    chosen = rng.permutation(inner)[: CANDIDATES * MOST]
-    pixels = np.column_stack([chosen % seen.shape[1], chosen // seen.shape[1]]).astype(float)
+    middles = np.argwhere(np.isfinite(values[0]).all(axis=0)[HALF :: 2 * HALF + 1, HALF :: 2 * HALF + 1])  # no pixel twice
+    pixels = HALF + (2 * HALF + 1.0) * rng.permutation(middles)[: CANDIDATES * MOST, ::-1]
     first, _, first_sigma = _read(values[0], sigmas[0], pixels)
     good = np.isfinite(first).all(axis=1)
     pixels, first, first_sigma = pixels[good], first[good], first_sigma[good]
