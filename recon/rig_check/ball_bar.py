@@ -17,7 +17,6 @@ from recon.estimation.covariance import whitening
 from recon.geometry.camera import Camera
 from recon.geometry.primitives import Fit, Sphere, fit_sphere
 from recon.model.calibration import Uncertainty, linearise
-from recon.rig_check.fringe_matches import SHARED
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, DeviceRows, points_by_light
 from recon.structured_light.decode import ProjectorMap
 from recon.structured_light.triangulate import Triangulator
@@ -45,6 +44,7 @@ class Limits:
 
 
 LIMITS = Limits()
+SHARED = 9  # pixels whose errors go together, by the optics' blur and the paint
 COMMON_PX = (
     0.03  # projector px, by which a sequence's phases err alike, against another's: gratings' shifts of some 5 % of a step
 )

@@ -5,8 +5,9 @@ parts from what one sees with the projector. Unknown are the errors of all calib
 the covariance of both as their prior. They are measured by fringes on the skin that both cameras see, and by views of the target
 in both; a ball bar tells the scale. What these leave open, such as a motion of all devices alike, keeps its prior.
 
-The size of the usual drift is a guess. Where a session shows more, the prior of drift, not that of the calibration, grows to the
-size of greatest evidence (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was rather pushed.
+The size of the usual drift is a guess, to within a factor of two. Where a session shows more, the prior of drift, not that of the
+calibration, grows to the size that is likeliest (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was
+rather pushed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +34,7 @@ Array = NDArray[np.float64]
 
 TURN_PER_PX, SHIFT_PER_PX = 3e-4, 0.2  # rad and mm of a mount for each px of drift; assumed: 15 urad and 10 um for 0.05 px
 SIZES = 2.0 ** (np.arange(17) / 4)  # of drift over the usual one, that are compared
+GUESSED = 2.0  # factor to which the usual drift is known, 1 sigma
 LARGEST = 8.0  # of these, that is still drift: 0.4 px
 ROUNDS = 3  # of linearising anew: a drift of a tenth of a pixel is all but linear
 
@@ -113,7 +115,7 @@ def estimate(
             certified = ball_bar.equations(bars, cameras, names, len(lengths))
             rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        size = max(priors, key=lambda size: seen.logarithm(priors[size]))
+        size = max(priors, key=lambda size: seen.logarithm(priors[size]) - 0.5 * (np.log(size) / np.log(GUESSED)) ** 2)
         mean, covariance = seen.posterior(priors[size])
         return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
 

@@ -1,8 +1,9 @@
 """Points of a smooth surface that both cameras see under the same fringes: the projector's coordinates there, and how they
 change.
 
-A point of camera 1 is put in space by the fringes; there camera 2 must see the same fringe. Maps are read by planes through small
-windows, so that a pixel's noise, and a surface's grain, count little.
+A point of camera 1 is put in space by the fringes; there camera 2 must see the same fringe. Maps are read by quadrics through
+small windows, so that a pixel's noise, and a surface's grain, count little. A plane would lie beside a curved surface, and not as
+far beside it in the other camera.
 """
 
 from collections.abc import Mapping
@@ -17,13 +18,22 @@ from recon.structured_light.decode import ProjectorMap
 
 Array = NDArray[np.float64]
 
-MOST = 1000  # points: fewer hardly show a shift of the projector, whose parallax lies below a point's noise
+MOST = 4000  # points: fewer hardly show a shift of the projector, whose parallax lies below a point's noise
 LEAST = 30
 HALF = 3  # px of a window, to each side of its middle
-CANDIDATES = 20  # windows tried, for one that is used
-FLAT_PX = 0.5  # projector px from a window's plane: beyond, an edge runs through it
-FLOOR_PX = 0.01  # projector px: errors of a map that a window's pixels share
-SHARED = 9  # pixels of a window whose errors go together: the optics' blur
+CANDIDATES = 5  # windows tried, for one that is used
+FLAT_PX = 0.5  # projector px from a window's quadric: beyond, an edge runs through it
+FLOOR_PX = 0.003  # projector px: errors of a map that a window's pixels share, on rendered skin; a sensor's noise isn't shared
+
+
+def _quadric(x: Array, y: Array) -> Array:
+    """Terms : (m, 6) of a quadratic surface at places : (m,) each."""
+    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+
+
+ACROSS, DOWN = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1.0),)))  # px, of a window's pixels
+QUADRIC = _quadric(ACROSS, DOWN)
+WINDOW_NOISE = float(np.linalg.norm(np.linalg.pinv(QUADRIC)[0]))  # of a window's middle, for 1 of each pixel
 
 
 def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera], rng: np.random.Generator, name: str) -> Matches:
@@ -59,24 +69,24 @@ def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera]
 
 
 def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) -> tuple[Array, Array, Array]:
-    """Values : (m, k), gradients : (m, k, 2), sigmas : (m, k) of k layers at places : (m, 2) px; NaN where a window is bent."""
+    """Values : (m, k), gradients : (m, k, 2), sigmas : (m, k) of k layers at places : (m, 2) px; NaN where an edge is near."""
     height, width = layers[0].shape
     with np.errstate(invalid="ignore"):
         inside = ((places >= HALF) & (places <= np.array([width, height]) - 1 - HALF)).all(axis=1)
     middle = np.where(inside[:, None], np.rint(places), HALF).astype(int)
-    across, down = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1),)))
-    columns, rows = middle[:, :1] + across, middle[:, 1:] + down
-    planes = np.linalg.pinv(np.column_stack([np.ones(len(across)), across, down]))
+    columns, rows = middle[:, :1] + ACROSS.astype(int), middle[:, 1:] + DOWN.astype(int)
+    x, y = (places - middle).T
     values, gradients, noises = [], [], []
     for layer, sigma in zip(layers, sigmas, strict=True):
         window = layer[rows, columns].astype(float)
-        plane = window @ planes.T
-        left = window - plane @ np.vstack([np.ones(len(across)), across, down])
+        bent = window @ np.linalg.pinv(QUADRIC).T
+        left = window - bent @ QUADRIC.T
         with np.errstate(invalid="ignore"):
             flat = inside & (np.abs(left).max(axis=1) < FLAT_PX)
-        value = plane[:, 0] + np.einsum("mi,mi->m", plane[:, 1:], places - middle)
+        value = np.einsum("mi,mi->m", bent, _quadric(x, y))
+        _, by_x, by_y, by_xx, by_xy, by_yy = bent.T
         claimed = np.sqrt(np.mean(left**2, axis=1)) if sigma is None else sigma[rows, columns].mean(axis=1)
         values.append(np.where(flat, value, np.nan))
-        gradients.append(plane[:, 1:])
-        noises.append(np.hypot(FLOOR_PX, claimed * np.sqrt(SHARED / len(across))))
+        gradients.append(np.column_stack([by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y]))
+        noises.append(np.hypot(FLOOR_PX, claimed * WINDOW_NOISE))
     return np.stack(values, axis=1), np.stack(gradients, axis=1), np.stack(noises, axis=1)

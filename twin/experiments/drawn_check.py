@@ -21,9 +21,9 @@ from recon.model.calibration import Uncertainty, moved
 from recon.model.rig import Target
 from recon.model.tracks import Track
 from recon.rig_check import bottom_equations
-from recon.rig_check.ball_bar import COMMON_PX, BallBar
+from recon.rig_check.ball_bar import COMMON_PX, SHARED, BallBar
 from recon.rig_check.bottom_equations import Lines
-from recon.rig_check.fringe_matches import FLOOR_PX, HALF, MOST, SHARED
+from recon.rig_check.fringe_matches import FLOOR_PX, MOST, WINDOW_NOISE
 from recon.rig_check.optics_equations import CAMERAS, PROJECTOR, Matches, points_by_light
 from recon.tracking.pose import aligned
 from recon.tracking.pose_fit import Sighting, meet
@@ -102,11 +102,11 @@ def measured(printed: Target, sigma_mm: float, rng: np.random.Generator) -> Targ
 def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px: float, rng: np.random.Generator) -> Matches:
     """Points of a mound under fringes along some axes, as windows of both cameras' maps show them.
 
-    sigma_px : of a pixel of a map, in projector px. A window's pixels err each by itself; more is claimed, as of real maps: on
-        two rendered breasts residuals are 0.25 of what is claimed.
+    sigma_px : of a pixel of a map, in projector px. A window's pixels err each by itself; a floor more is claimed: on two
+        rendered breasts residuals are 0.9 of what is claimed.
     """
-    count = (2 * HALF + 1) ** 2
-    claimed, sigma_px = float(np.hypot(FLOOR_PX, sigma_px * np.sqrt(SHARED / count))), sigma_px / np.sqrt(count)
+    sigma_px *= WINDOW_NOISE
+    claimed = float(np.hypot(FLOOR_PX, sigma_px))
     width, height = known["cam1"].size
     pixels = rng.uniform([VIEW_PX, VIEW_PX], [width - VIEW_PX, height - VIEW_PX], (4 * MOST, 2))
     first = _shown(true, "cam1", pixels)[:, list(axes)]
