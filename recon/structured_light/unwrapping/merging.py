@@ -33,6 +33,27 @@ class Regions:
     disputed: set[int]  # regions whose votes disagree, or that contradict themselves
 
 
+@dataclass(frozen=True)
+class _Border:
+    """Contacts of a region with another one."""
+
+    continuous: Counter  # by order offset, the other's root less this one's
+    torn: int
+    whole: bool  # continuous between one basin of each
+
+    def joined(self, other: "_Border", step: int) -> "_Border":
+        """With those of a region that joins this one, whose root is `step` orders higher."""
+        continuous = self.continuous + Counter({k + step: n for k, n in other.continuous.items()})
+        return _Border(continuous, self.torn + other.torn, self.whole or other.whole)
+
+    def turned(self) -> "_Border":
+        """As the other has it."""
+        return _Border(Counter({-k: n for k, n in self.continuous.items()}), self.torn, self.whole)
+
+
+NO_BORDER = _Border(Counter(), 0, False)
+
+
 def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[int]) -> Regions:
     """Join basins into regions over continuous borders, the longest first, and anchor them by the line's votes.
 
@@ -54,27 +75,25 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
     members = {p: [p] for p in range(count)}
     anchored = {p: order for p, tally in votes.items() if (order := _verdict(tally)) is not None}
     refused = broken | {p for p, tally in votes.items() if tally.total() >= VOTES and p not in anchored}
-    links: dict[int, dict[int, Counter]] = defaultdict(dict)
-    torn: dict[int, Counter] = defaultdict(Counter)
-    for (p, q), offsets in borders.continuous.items():
+    bordering: dict[int, dict[int, _Border]] = defaultdict(dict)
+    for p, q in dict.fromkeys((*borders.continuous, *borders.torn)):
+        offsets, torn = borders.continuous.get((p, q), Counter()), borders.torn[p, q]
         if not {p, q} & refused:
-            links[p][q], links[q][p] = Counter(offsets), Counter({-k: n for k, n in offsets.items()})
-    for (p, q), n in borders.torn.items():
-        torn[p][q] += n
-        torn[q][p] += n
-    whole: dict[int, set[int]] = defaultdict(set)  # neighbours by a border that is continuous
-    for p, its in links.items():
-        whole[p] = {q for q, offsets in its.items() if max(offsets.values()) >= CONTINUOUS * (offsets.total() + torn[p][q])}
+            whole = max(offsets.values(), default=0) >= CONTINUOUS * (offsets.total() + torn)
+            bordering[p][q] = border = _Border(offsets, torn, whole)
+            bordering[q][p] = border.turned()
 
     def proposal(p: int, q: int) -> tuple[float, int] | None:
         """Strength of p and q as one surface, and the order of q's root less p's; None if they can't be."""
-        offsets = links[p][q]
+        border = bordering[p][q]
+        if not border.continuous:
+            return None
         if p in anchored and q in anchored:
             k = anchored[q] - anchored[p]
-            return (offsets[k], k) if offsets[k] else None
-        k, n = offsets.most_common(1)[0]
-        share = n / (offsets.total() + torn[p][q])
-        least = MOSTLY if q in whole[p] and n >= AGREEMENT * offsets.total() else CONTINUOUS
+            return (border.continuous[k], k) if border.continuous[k] else None
+        (k, n), total = border.continuous.most_common(1)[0], border.continuous.total()
+        share = n / (total + border.torn)
+        least = MOSTLY if border.whole and n >= AGREEMENT * total else CONTINUOUS
         return (n * share, k) if share >= least else None
 
     age = [0] * count
@@ -85,11 +104,11 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
             heapq.heappush(queue, (-found[0], p, q, age[p] + age[q]))
 
     for p, q in borders.continuous:
-        if q in links[p]:
+        if q in bordering[p]:
             propose(p, q)
     while queue:
         _, p, q, born = heapq.heappop(queue)
-        if q not in links[p] or born != age[p] + age[q]:
+        if q not in bordering[p] or born != age[p] + age[q]:
             continue
         _, k = proposal(p, q) or (0, 0)
         if len(members[p]) < len(members[q]):
@@ -99,20 +118,13 @@ def join(count: int, borders: Borders, votes: dict[int, Counter], broken: set[in
         members[p] += members.pop(q)
         if q in anchored:
             anchored.setdefault(p, anchored.pop(q) - k)
-        del links[p][q], links[q][p]
-        for other in whole.pop(q, set()) - {p}:
-            whole[p].add(other)
-            whole[other].add(p)
-        for other, n in torn.pop(q, Counter()).items():
-            torn[p][other] += n
-            torn[other][p] += n
-        for other, offsets in links.pop(q).items():
-            moved = Counter({step + k: n for step, n in offsets.items()})
-            del links[other][q]
-            links[p][other] = links[p].get(other, Counter()) + moved
-            links[other][p] = Counter({-step: n for step, n in links[p][other].items()})
+        del bordering[p][q], bordering[q][p]
+        for other, border in bordering.pop(q).items():
+            del bordering[other][q]
+            bordering[p][other] = bordering[p].get(other, NO_BORDER).joined(border, k)
+            bordering[other][p] = bordering[p][other].turned()
         age[p] += 1
-        for other in links[p]:
+        for other in bordering[p]:
             propose(p, other)
 
     absolute, disputed = {}, set()
