@@ -1,12 +1,13 @@
 """Time calibration: the lag of the scanner's images behind the poses, from an up-and-down motion over a flat bottom.
 
-The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t` with six coordinates x of its pose.
-Above all it follows the height; but the target stands off from the array, so that a hand that tilts by half a degree moves the
-one by a millimetre and not the other. For tilts of some degrees depth is linear in the coordinates, and needs no calibrated
-probe. The trend c, of 0.2 mm or so, is of a bracket that gives, which would look like a lag of 2 ms. Both streams have time
-stamps of their own, so jitter and dropped frames add errors of their own size only: the pose is interpolated at the moment of
-each image. The lag is the offset of the clocks and the delays together; where the clocks drift against each other by 50 ppm it
-changes by 3 ms a minute, so calibrate anew for long sessions.
+The bottom's depth in the image follows the probe: `depth(t) = a + b . x(t - lag) + c t`, where x are six coordinates of its pose
+and products of its turn with itself and with the height. Above all depth follows the height; but the target stands off from the
+array, so that a hand that tilts by half a degree moves the one by a millimetre and not the other. Products are what tilts of some
+degrees add; their slopes are held to the size that arms and beams have, and no calibrated probe is needed. The trend c, of 0.2 mm
+or so, is of a bracket that gives, which would look like a lag of 2 ms. Both streams have time stamps of their own, so jitter and
+dropped frames add errors of their own size only: the pose is interpolated at the moment of each image. The lag is the offset of
+the clocks and the delays together; where the clocks drift against each other by 50 ppm it changes by 3 ms a minute, so calibrate
+anew for long sessions.
 
 Move the probe by 10 mm or more, three times or more, at an uneven pace: a periodic motion fits at more than one lag.
 """
@@ -43,6 +44,8 @@ VALLEY = 0.8  # correlation between two such lags, over the best, that separates
 MOST_PAIRED = 1000  # images by whose pairs the fit begins
 GATE = 4.0  # normalised residual of an outlier
 ALIKE_S = 0.3  # within which errors go together: those of the spline, at least
+ARM_MM = 150.0  # from the target to the bottom's echo: depth by a turn times a turn
+BEAM = 0.5  # sine of the angle between beam and motion: depth by height times a turn
 GIVES_MM = 0.2  # standard deviation of a bracket's giving over the sweep: one stroke alone doesn't tell it from a lag
 COVERAGE = 0.95  # of the interval
 FAR_MM = 1.0  # of a trend, that no bracket gives
@@ -91,12 +94,12 @@ def estimate(times: NDArray[np.int64], depths: Array, track: Track, search_s: tu
         raise InputError(f"depths: expected at least {MIN_FRAMES} images that show the bottom, found {seen.sum()}")
     if track.found.sum() < MIN_FRAMES:
         raise InputError(f"track: expected at least {MIN_FRAMES} poses, found {track.found.sum()}")
-    coordinates = _coordinates(track)
+    coordinates, sizes = _coordinates(track)
     origin = int(track.times[0])
     seconds = (times - origin) * 1e-9
     moments = (track.times[track.found] - origin) * 1e-9
     start = _search(seconds[seen], depths[seen], moments, coordinates[:, 0], search_s)
-    return _refined(seconds, depths, moments, _smooth(moments, coordinates), start, search_s)
+    return _refined(seconds, depths, moments, _smooth(moments, coordinates), sizes, start, search_s)
 
 
 def measure(depths: Array, found: Lag) -> Metrics:
@@ -166,10 +169,11 @@ def _line(u: Array, v: Array, blocks: int) -> tuple[float, float]:
     return height, slope
 
 
-def _coordinates(track: Track) -> Array:
-    """Coordinates of the valid poses, about their mean : (n, 3 to 6).
+def _coordinates(track: Track) -> tuple[Array, Array]:
+    """Coordinates of the valid poses, about their mean : (n, 3 to 15), and the standard deviations of depth by each : (3 to 15,).
 
-    The height along the main direction of the motion, mm; the place across it; the turn, rad. Constant ones are left out.
+    The height along the main direction of the motion, mm, and the place across it; the turn, rad; products of turns; the height
+    times the turn. Constant ones are left out. Slopes by all but products are open.
     """
     poses = track.poses[track.found]
     places = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
@@ -178,8 +182,12 @@ def _coordinates(track: Track) -> Array:
     if extent < MIN_RANGE_MM:
         raise InputError(f"track: expected an up-and-down motion of at least {MIN_RANGE_MM:g} mm, found {extent:.1f} mm")
     rotations = Rotation.from_matrix(poses[:, :3, :3])
-    coordinates = np.column_stack([places, (rotations * rotations.mean().inv()).as_rotvec()])
-    return coordinates[:, np.ptp(coordinates, axis=0) > STILL]
+    turns = (rotations * rotations.mean().inv()).as_rotvec()
+    first, second = np.triu_indices(3)
+    coordinates = np.column_stack([places, turns, turns[:, first] * turns[:, second], places[:, :1] * turns])
+    sizes = np.repeat([np.inf, ARM_MM, BEAM], [6, 6, 3])
+    moving = np.ptp(coordinates, axis=0) > STILL
+    return coordinates[:, moving], sizes[moving]
 
 
 def _smooth(moments: Array, coordinates: Array) -> BSpline:
@@ -235,7 +243,15 @@ def _search(seconds: Array, depths: Array, moments: Array, heights: Array, searc
     return float(lags[best])
 
 
-def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, start: float, search_s: tuple[float, float]) -> Lag:
+def _refined(
+    seconds: Array,
+    depths: Array,
+    moments: Array,
+    spline: BSpline,
+    sizes: Array,
+    start: float,
+    search_s: tuple[float, float],
+) -> Lag:
     """Weighted least squares over a, b, c and the lag, with variances of depth and of time estimated from the residuals."""
     lag, speed, trend = start, spline.derivative(), seconds - seconds.mean()
     seen = np.isfinite(depths)
@@ -249,10 +265,10 @@ def _refined(seconds: Array, depths: Array, moments: Array, spline: BSpline, sta
         weights = np.where(used & inside, 1 / variance, 0)
         design = np.column_stack([np.ones_like(seconds), spline(seconds - lag), trend, -speed(seconds - lag) @ line[1:-1]])
         missing = np.where(seen, depths, 0) - design[:, :-1] @ line
-        root, held = np.sqrt(weights), np.zeros(design.shape[1])
-        held[-2] = np.ptp(seconds) / (GIVES_MM * max(abs(line[1]), 1e-9))
-        equations = np.vstack([design * root[:, None], held]), np.append(missing * root, -held[-2] * line[-1])
-        step = np.linalg.lstsq(*equations, rcond=None)[0]
+        root, per_mm = np.sqrt(weights), max(abs(line[1]), 1e-9)
+        held = np.diag(np.r_[0, 1 / (sizes * per_mm), np.ptp(seconds) / (GIVES_MM * per_mm), 0])
+        left = np.append(missing * root, -held[:, :-1] @ line)
+        step = np.linalg.lstsq(np.vstack([design * root[:, None], held]), left, rcond=None)[0]
         line, lag = line + step[:-1], lag + float(np.clip(step[-1], -0.05, 0.05))
         predicted = line[0] + spline(seconds - lag) @ line[1:-1] + trend * line[-1]
         residuals = np.where(inside, depths - predicted, np.nan)
@@ -303,9 +319,9 @@ def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held
     """Standard deviation of the lag from the residuals, each enlarged by its leverage: the larger of two sandwich estimates.
 
     The one takes errors as independent, the other as alike within `ALIKE_S` (Newey and West 1987); tremor, whose errors change
-    sign from image to image, makes the second too small. To both is added what the trend's own size leaves open, as `held`.
+    sign from image to image, makes the second too small. To both is added what the sizes of slopes leave open, as `held`.
     """
-    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]) + np.outer(held, held))
+    inverse = np.linalg.pinv(design.T @ (design * weights[:, None]) + held.T @ held)
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
     pulls = inverse[-1] @ (design * (weights * residuals / (1 - np.minimum(leverage, 0.9)))[:, None]).T
     alone = alike = float(pulls @ pulls)
@@ -314,4 +330,4 @@ def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held
         if not near.any():
             break
         alike += 2 * float(pulls[k:] @ (near * pulls[:-k]))
-    return float(np.sqrt(max(alone, alike) + (inverse[-1] @ held) ** 2))
+    return float(np.sqrt(max(alone, alike) + np.sum((held @ inverse[-1]) ** 2)))

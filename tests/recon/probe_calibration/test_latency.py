@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -108,6 +109,26 @@ def test_a_hand_that_tilts_moves_the_target_and_not_the_lag(rng):
     assert found.depth_sigma < 1.5
 
 
+def test_tilts_of_some_degrees_within_a_second_do_not_shift_the_lag():
+    """Over twelve hands that tilt by 4 deg about a probe held at 10 deg; without products the lag is off by 1.2 ms."""
+    errors, normal = [], []
+    for seed in range(12):
+        rng, t = np.random.default_rng(seed), np.arange(0, 12, 0.025)
+        paces, begins = rng.uniform(0.3, 1.0, (3, 1)), rng.uniform(0, 2 * np.pi, (3, 1))
+        turns = Rotation.from_rotvec(np.deg2rad(4 * np.sin(2 * np.pi * paces * t + begins).T + 10 * rng.standard_normal(3)))
+        faces = np.column_stack([0 * t, 0 * t, height(t)])  # 45 mm above a bottom that is level
+        depths = (45 - faces[:, 2]) / turns.as_matrix()[:, 2, 2]
+        targets = faces - turns.apply([10, 120, -20])
+        poses = np.array([rigid.transform(*each) for each in zip(turns.as_matrix(), targets, strict=True)])
+        poses[:, :3, 3] += POSE_NOISE_MM * rng.standard_normal((len(t), 3))
+        shown = np.arange(0.2, 11.8, FRAME_S)
+        seen = np.interp(shown, t, depths) / bscans.MM_PER_PX + DEPTH_NOISE_PX * rng.standard_normal(len(shown))
+        found = latency.estimate(nanoseconds(shown + 0.05), seen, Track(nanoseconds(t), poses))
+        errors.append(found.seconds - 0.05)
+        normal.append(errors[-1] / found.sigma_s)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.0004 and np.sqrt(np.mean(np.square(normal))) < 1.6
+
+
 @pytest.mark.parametrize("gives_mm", [-0.3, 0.3])
 def test_a_bracket_that_gives_moves_the_bottom_and_not_the_lag(rng, gives_mm):
     """By 0.3 mm over 5 s of an uneven motion; without a trend it would look like a lag of 0.65 ms."""
@@ -175,13 +196,13 @@ def test_a_lag_outside_the_search_is_refused():
 def test_a_lag_that_does_not_settle_or_leaves_the_search_is_refused(rng):
     """Begun 1 s off, the fit goes 50 ms a round; begun within a search that ends before the lag, it goes to the lag."""
     times, depths, track = streams(0.1, rng)
-    coordinates, seconds = latency._coordinates(track), (times - track.times[0]) * 1e-9
+    (coordinates, sizes), seconds = latency._coordinates(track), (times - track.times[0]) * 1e-9
     moments = (track.times[track.found] - track.times[0]) * 1e-9
     spline = latency._smooth(moments, coordinates)
     with pytest.raises(InputError, match="depths: expected "):
-        latency._refined(seconds, depths, moments, spline, 1.1, (-2, 2))
+        latency._refined(seconds, depths, moments, spline, sizes, 1.1, (-2, 2))
     with pytest.raises(InputError, match=r"search_s: expected the lag within -0.5 to 0.09 s, found 0.\d+ s"):
-        latency._refined(seconds, depths, moments, spline, 0.08, (-0.5, 0.09))
+        latency._refined(seconds, depths, moments, spline, sizes, 0.08, (-0.5, 0.09))
 
 
 def test_too_few_images_are_refused():
