@@ -5,9 +5,8 @@ parts from what one sees with the projector. Unknown are the errors of all calib
 the covariance of both as their prior. They are measured by fringes on the skin that both cameras see, and by views of the target
 in both; a ball bar tells the scale. What these leave open, such as a motion of all devices alike, keeps its prior.
 
-The size of the usual drift is a guess, to within a factor of two. Where a session shows more, the prior of drift, not that of the
-calibration, grows to the size that is likeliest (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was
-rather pushed.
+The size of the usual drift is a guess, to within a factor of two. Corrections are averaged over sizes as likely as the session
+makes them (MacKay 1992, Bayesian interpolation); beyond a limit a device was rather pushed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.special import softmax
 
 from recon.estimation.covariance import root
 from recon.geometry import rigid
@@ -76,7 +76,7 @@ class Drift:
     before: Calibration
     prior: Uncertainty  # of the calibration as it was, after drift of the size below
     after: Calibration  # with the covariance that is left
-    size: float  # of drift over the usual one, 1 where a session shows no more
+    size: float  # of drift over the usual one: the median
     surprise: float  # standard deviations of a normal number as unlikely as what the session shows, by usual drift
 
 
@@ -108,16 +108,19 @@ def estimate(
     priors = {float(size): block_diag(root(fixed + size**2 * drifting), lengths) for size in SIZES}
 
     def solve(step: Array) -> tuple[Array, Array, float, Evidence]:
-        """The next step from the calibration, its covariance, and the size of drift."""
+        """The next step from the calibration, its covariance, and the median size of drift."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
         if bars is not None:
             certified = ball_bar.equations(bars, cameras, names, len(lengths))
             rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        size = max(priors, key=lambda size: seen.logarithm(priors[size]) - 0.5 * (np.log(size) / np.log(GUESSED)) ** 2)
-        mean, covariance = seen.posterior(priors[size])
-        return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
+        chances = softmax([seen.logarithm(prior) - 0.5 * (np.log(size) / np.log(GUESSED)) ** 2 for size, prior in priors.items()])
+        means, within = (np.stack(each) for each in zip(*map(seen.posterior, priors.values()), strict=True))
+        mean = chances @ means
+        covariance = np.tensordot(chances, within, 1) + (means - mean).T @ (chances[:, None] * (means - mean))
+        size = SIZES[np.searchsorted(np.cumsum(chances), 0.5)]
+        return mean[: len(names)], covariance[: len(names), : len(names)], float(size), seen
 
     step, left, size, seen = solve(np.zeros(len(names)))
     for _ in range(ROUNDS - 1):

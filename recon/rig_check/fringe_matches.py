@@ -55,38 +55,41 @@ def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera]
     values, sigmas = ([[camera[k][part] for k in axes] for camera in layers] for part in (0, 1))
     middles = np.argwhere(np.isfinite(values[0]).all(axis=0)[HALF :: 2 * HALF + 1, HALF :: 2 * HALF + 1])  # no pixel twice
     pixels = HALF + (2 * HALF + 1.0) * rng.permutation(middles)[: CANDIDATES * MOST, ::-1]
-    first, _, first_sigma = _read(values[0], sigmas[0], pixels)
+    first, _, _, first_sigma = _read(values[0], sigmas[0], pixels)
     good = np.isfinite(first).all(axis=1)
     pixels, first, first_sigma = pixels[good], first[good], first_sigma[good]
     seen_at = cameras["cam2"].project(points_by_light(pixels, first, axes, cameras))
-    second, gradient, second_sigma = _read(values[1], sigmas[1], seen_at)
+    second, gradient, bend, second_sigma = _read(values[1], sigmas[1], seen_at)
     both = np.flatnonzero(np.isfinite(second).all(axis=1))[:MOST]
     if len(both) < LEAST:
         found = f"{len(both)}: a smooth thing in the middle of both views, or {' and '.join(CAMERAS)} under other names?"
         raise InputError(f"{name}: expected {LEAST} points that both cameras see under the {PROJECTOR}'s fringes, found {found}")
     sigma = np.stack([first_sigma, second_sigma], axis=1)
-    return Matches(pixels, first, seen_at, second, gradient, sigma, axes).some(both)
+    return Matches(pixels, first, seen_at, second, gradient, bend, sigma, axes).some(both)
 
 
-def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) -> tuple[Array, Array, Array]:
-    """Values : (m, k), gradients : (m, k, 2), sigmas : (m, k) of k layers at places : (m, 2) px; NaN where an edge is near."""
+def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) -> tuple[Array, Array, Array, Array]:
+    """Values : (m, k), gradients : (m, k, 2), second derivatives : (m, k, 2, 2), and sigmas : (m, k) of the values.
+
+    Of k layers, at places : (m, 2) px; values are NaN where an edge is near.
+    """
     height, width = layers[0].shape
     with np.errstate(invalid="ignore"):
         inside = ((places >= HALF) & (places <= np.array([width, height]) - 1 - HALF)).all(axis=1)
     middle = np.where(inside[:, None], np.rint(places), HALF).astype(int)
     columns, rows = middle[:, :1] + ACROSS.astype(int), middle[:, 1:] + DOWN.astype(int)
-    x, y = (places - middle).T
-    values, gradients, noises = [], [], []
+    aside = places - middle
+    values, gradients, bends, noises = [], [], [], []
     for layer, sigma in zip(layers, sigmas, strict=True):
         window = layer[rows, columns].astype(float)
-        bent = window @ np.linalg.pinv(QUADRIC).T
-        left = window - bent @ QUADRIC.T
+        found = window @ np.linalg.pinv(QUADRIC).T
+        left = window - found @ QUADRIC.T
         with np.errstate(invalid="ignore"):
             flat = inside & (np.abs(left).max(axis=1) < FLAT_PX)
-        value = np.einsum("mi,mi->m", bent, _quadric(x, y))
-        _, by_x, by_y, by_xx, by_xy, by_yy = bent.T
+        bend = found[:, [[3, 4], [4, 5]]] * [[2, 1], [1, 2]]
         claimed = np.sqrt(np.mean(left**2, axis=1)) if sigma is None else sigma[rows, columns].mean(axis=1)
-        values.append(np.where(flat, value, np.nan))
-        gradients.append(np.column_stack([by_x + 2 * by_xx * x + by_xy * y, by_y + by_xy * x + 2 * by_yy * y]))
+        values.append(np.where(flat, np.einsum("mi,mi->m", found, _quadric(*aside.T)), np.nan))
+        gradients.append(found[:, 1:3] + np.einsum("mij,mj->mi", bend, aside))
+        bends.append(bend)
         noises.append(np.hypot(FLOOR_PX, claimed * WINDOW_NOISE))
-    return np.stack(values, axis=1), np.stack(gradients, axis=1), np.stack(noises, axis=1)
+    return np.stack(values, axis=1), np.stack(gradients, axis=1), np.stack(bends, axis=1), np.stack(noises, axis=1)

@@ -48,12 +48,13 @@ class Matches(NamedTuple):
     seen_at: Array  # (m, 2) px of camera 2, where the points are to be seen by the calibration
     second: Array  # (m, k) projector px there
     gradient: Array  # (m, k, 2) of camera 2's map there
+    bend: Array  # (m, k, 2, 2) its second derivatives
     sigma: Array  # (m, 2, k) projector px, of first and second
     axes: tuple[int, ...]  # (k,) 0 of columns, 1 of rows
 
     def some(self, chosen: NDArray) -> "Matches":
         """Those of a mask or of numbers."""
-        arrays = (self.pixels, self.first, self.seen_at, self.second, self.gradient, self.sigma)
+        arrays = (self.pixels, self.first, self.seen_at, self.second, self.gradient, self.bend, self.sigma)
         first, *others = (each[chosen] for each in arrays)
         return Matches(first, *others, axes=self.axes)
 
@@ -115,14 +116,15 @@ def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, 
     axes, (m, k) = list(matches.axes), matches.first.shape
     points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
     first, second, light = (linearise(cameras, name, points, names) for name in (*CAMERAS, PROJECTOR))
-    shown, rows = light.pixels[:, axes], []
+    shown, aside, rows = light.pixels[:, axes], second.pixels - matches.seen_at, []
+    bent = np.einsum("mkij,mj->mki", matches.bend, aside)
     for by_first, by_second, by_light in (
         (first.by_point, second.by_point, light.by_point[:, axes]),
         (first.by_parameter, second.by_parameter, light.by_parameter[:, axes]),
     ):  # a map is read at camera 2's predicted pixel, not at that of the point
-        rows.append(np.concatenate([by_first, by_light, by_light - matches.gradient @ by_second], axis=1))
-    elsewhere = np.einsum("mki,mi->mk", matches.gradient, matches.seen_at - second.pixels)
-    missing = np.concatenate([np.zeros((m, 2)), matches.first - shown, matches.second - shown - elsewhere], axis=1)
+        rows.append(np.concatenate([by_first, by_light, by_light - (matches.gradient + bent) @ by_second], axis=1))
+    elsewhere = np.einsum("mki,mi->mk", matches.gradient + bent / 2, aside)
+    missing = np.concatenate([np.zeros((m, 2)), matches.first - shown, matches.second - shown + elsewhere], axis=1)
     sigma = np.concatenate([np.full((m, 2), EXACT_PX), matches.sigma.reshape(m, 2 * k)], axis=1)[..., None]
     free = eliminate(rows[0] / sigma, np.concatenate([missing[..., None], rows[1]], axis=2) / sigma)
     by_optics = free[..., 1:].reshape(-1, len(names))

@@ -24,7 +24,7 @@ from recon.reports import page
 from recon.reports.page import Opening, Section
 from recon.rig_check import ball_bar, drift, fringe_matches
 from recon.rig_check.ball_bar import Bars
-from recon.rig_check.drift import LARGEST, SIZES, Drift
+from recon.rig_check.drift import GUESSED, LARGEST, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
 from recon.session.settings import BarFields
@@ -81,10 +81,9 @@ class Corrected:
 
     def beyond(self, drift_px: float) -> str:
         """A fault: more than drift."""
-        size = f"{self.drift.size:.0f} times as much{' or more' if self.drift.size == SIZES[-1] else ''}"
         expected = f"expected devices that drifted by some {drift_px:g} px since their calibration"
         cause = "was one pushed? `sonotwin check` names it; or is it another calibration?"
-        return f"{expected}, found {size}: {cause} drift_px=... is of a rig that drifts more"
+        return f"{expected}, found more than {LARGEST:g} times as much: {cause} drift_px=... is of a rig that drifts more"
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
@@ -294,7 +293,7 @@ def changes(found: Drift) -> dict[str, tuple[float, float]]:
 
 def describe(found: Corrected) -> Iterator[str]:
     """Lines: how much drifted, and what it would have cost."""
-    size = "as usual" if found.drift.size == 1 else f"{found.drift.size:.1f} times the usual"
+    size = "as usual" if found.drift.size < GUESSED else f"{found.drift.size:.1f} times the usual"
     yield f"drift       {size} ({found.drift.surprise:.1f} sigma by usual drift)"
     told = changes(found.drift)
     for device in found.drift.after.cameras:
@@ -324,7 +323,7 @@ def write_page(found: Corrected, name: str) -> str:
     lines = [page.paragraph(line) for line in READING]
     sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
     figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
-    usual = found.drift.size == 1
+    usual = found.drift.size < GUESSED
     result = "Devices drifted as usual, or less." if usual else f"Devices drifted {found.drift.size:.1f} times as far as usual."
     if "skin_moved_mm" in found.figures:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]

@@ -35,7 +35,7 @@ PAIRS = 40  # of the film: as many as `sonotwin check` takes
 REACH_MM, DEPTHS_MM, TILT_DEG = (50.0, 40.0), (606.0, 713.0), 20.0  # of the target in it
 GROUND_MM, HEIGHT_MM, WIDTH_MM = 700.0, 45.0, 45.0  # of a mound under the fringes
 VIEW_PX = 60  # that the points keep from camera 1's border
-WINDOW_PX = 2.0  # to both sides, over which a map's gradient is taken
+WINDOW_PX = 2.0  # to both sides, over which a map's derivatives are taken
 BOTTOM_MM = 700.0  # z of the tank's bottom
 SWINGS_HZ, ROCK_DEG, ROLL_DEG = (0.37, 0.23, 0.11), 20.0, 75.0  # of tilts forward and sideways, and of the roll
 BOB_MM, BOB_HZ, SCANNER_HZ = 6.0, 0.35, 20.0
@@ -116,12 +116,16 @@ def drawn_matches(true: Devices, known: Devices, axes: tuple[int, ...], sigma_px
     inside = ((seen_at > VIEW_PX) & (seen_at < np.array(known["cam2"].size) - VIEW_PX)).all(axis=1)
     inside &= ((exact > 0) & (exact < np.array(known[PROJECTOR].size) - 1)).all(axis=1)
     chosen = np.flatnonzero(inside)[:MOST]
-    steps = WINDOW_PX * np.eye(2)
-    gradient = np.stack([_shown(true, "cam2", seen_at + step) - _shown(true, "cam2", seen_at - step) for step in steps], axis=2)
-    second = exact[:, list(axes)] + sigma_px * rng.standard_normal(first.shape)
+    pixels, first, seen_at, second = pixels[chosen], first[chosen], seen_at[chosen], exact[chosen][:, list(axes)]
+    steps = WINDOW_PX * np.arange(-1, 2)
+    near = np.array([[_shown(true, "cam2", seen_at + np.array([x, y]))[:, list(axes)] for y in steps] for x in steps])
+    gradient = np.stack([near[2, 1] - near[0, 1], near[1, 2] - near[1, 0]], axis=-1) / (2 * WINDOW_PX)
+    across, down = (near[2, 1] - 2 * second + near[0, 1], near[1, 2] - 2 * second + near[1, 0])
+    turned = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4
+    bend = np.stack([across, turned, turned, down], axis=-1).reshape(*second.shape, 2, 2) / WINDOW_PX**2
+    second = second + sigma_px * rng.standard_normal(second.shape)
     sigma = np.full((len(pixels), 2, len(axes)), claimed)
-    every = Matches(pixels, first, seen_at, second, gradient[:, list(axes)] / (2 * WINDOW_PX), sigma, axes)
-    return every.some(chosen)
+    return Matches(pixels, first, seen_at, second, gradient, bend, sigma, axes)
 
 
 def drawn_bar(true: Devices, centres_mm: Array, ball_mm: float, sigma_px: float, rng: np.random.Generator) -> BallBar:
