@@ -37,13 +37,14 @@ KNOT_S = 0.1  # of the spline through the motion: hands move below 3 Hz
 STILL = 1e-9  # mm or rad: a coordinate that changes by less is left out
 MIN_OVERLAP = 0.6  # of the images with a pose
 MIN_CORRELATION = 0.6  # of depth and height, by ranks, outliers among them
-MIN_AGREEMENT = 0.95  # their correlation without outliers
+MIN_AGREEMENT = 0.98  # their correlation without outliers
 MAX_OUTLIERS = 0.4  # of the images
 RIVAL = 0.98  # correlation of another lag, over the best, that makes the motion ambiguous
 VALLEY = 0.8  # correlation between two such lags, over the best, that separates them
 MOST_PAIRED = 1000  # images by whose pairs the fit begins
 GATE = 4.0  # normalised residual of an outlier
 ALIKE_S = 0.3  # within which errors go together: those of the spline, at least
+TILTS_S = 5.5  # of a sweep from which products with the turn are told: a shorter one has fewer swings than slopes
 ARM_MM = 150.0  # from the target to the bottom's echo: depth by a turn times a turn
 BEAM = 0.5  # sine of the angle between beam and motion: depth by height times a turn
 GIVES_MM = 0.2  # standard deviation of a bracket's giving over the sweep: one stroke alone doesn't tell it from a lag
@@ -172,8 +173,8 @@ def _line(u: Array, v: Array, blocks: int) -> tuple[float, float]:
 def _coordinates(track: Track) -> tuple[Array, Array]:
     """Coordinates of the valid poses, about their mean : (n, 3 to 15), and the standard deviations of depth by each : (3 to 15,).
 
-    The height along the main direction of the motion, mm, and the place across it; the turn, rad; products of turns; the height
-    times the turn. Constant ones are left out. Slopes by all but products are open.
+    The height along the main direction of the motion, mm, and the place across it; the turn, rad; of a sweep of 5.5 s and more
+    products of turns, and the height times the turn. Constant ones are left out. Slopes by all but products are open.
     """
     poses = track.poses[track.found]
     places = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
@@ -186,8 +187,9 @@ def _coordinates(track: Track) -> tuple[Array, Array]:
     first, second = np.triu_indices(3)
     coordinates = np.column_stack([places, turns, turns[:, first] * turns[:, second], places[:, :1] * turns])
     sizes = np.repeat([np.inf, ARM_MM, BEAM], [6, 6, 3])
-    moving = np.ptp(coordinates, axis=0) > STILL
-    return coordinates[:, moving], sizes[moving]
+    told = np.ptp(track.times[track.found]) > TILTS_S * 1e9
+    used = (np.ptp(coordinates, axis=0) > STILL) & (told | np.isinf(sizes))
+    return coordinates[:, used], sizes[used]
 
 
 def _smooth(moments: Array, coordinates: Array) -> BSpline:
@@ -282,14 +284,15 @@ def _refined(
             raise InputError(f"depths: expected at least {MIN_FRAMES} images that agree on a lag, found {used.sum()}")
         if round_ > 4 and abs(step[-1]) < 1e-7:
             break
-    _agree(predicted - trend * line[-1], depths - trend * line[-1], inside, used)
-    sigma = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used], held)
+    products = spline(seconds - lag)[:, np.isfinite(sizes)] @ line[1:-1][np.isfinite(sizes)]
+    _agree(predicted - products - trend * line[-1], depths - trend * line[-1], inside, used)
+    sigma, freedom = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used], held)
     if abs(step[-1]) > sigma:
         found = f"it still moving by {1e3 * abs(step[-1]):.1f} ms a round, {lag:.3f} s at last"
         raise InputError(f"depths: expected the lag to settle near {start:.2f} s, found {found}")
     if not search_s[0] <= lag <= search_s[1]:
         raise InputError(f"search_s: expected the lag within {search_s[0]:g} to {search_s[1]:g} s, found {lag:.3f} s")
-    reach = float(stats.t.ppf((1 + COVERAGE) / 2, used.sum() - design.shape[1])) * sigma
+    reach = float(stats.t.ppf((1 + COVERAGE) / 2, freedom)) * sigma
     gives = float(line[-1] * np.ptp(seconds) / abs(line[1]))
     return Lag(lag, sigma, (lag - reach, lag + reach), jitter, float(np.sqrt(depth_variance)), used, residuals, gives)
 
@@ -315,11 +318,12 @@ def _two_variances(residuals: Array, rates: Array, spread: float) -> tuple[float
     return float(depth), float(np.sqrt(time))
 
 
-def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held: Array) -> float:
-    """Standard deviation of the lag from the residuals, each enlarged by its leverage: the larger of two sandwich estimates.
+def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held: Array) -> tuple[float, float]:
+    """Standard deviation of the lag from the residuals, each enlarged by its leverage, and their number of degrees of freedom.
 
-    The one takes errors as independent, the other as alike within `ALIKE_S` (Newey and West 1987); tremor, whose errors change
-    sign from image to image, makes the second too small. To both is added what the sizes of slopes leave open, as `held`.
+    It is the larger of two sandwich estimates. The one takes errors as independent, the other as alike within `ALIKE_S` (Newey
+    and West 1987); tremor, whose errors change sign from image to image, makes the second too small. To both is added what the
+    sizes of slopes leave open, as `held`.
     """
     inverse = np.linalg.pinv(design.T @ (design * weights[:, None]) + held.T @ held)
     leverage = np.einsum("ni,ij,nj->n", design, inverse, design) * weights
@@ -330,4 +334,5 @@ def _sigma(design: Array, residuals: Array, weights: Array, seconds: Array, held
         if not near.any():
             break
         alike += 2 * float(pulls[k:] @ (near * pulls[:-k]))
-    return float(np.sqrt(max(alone, alike) + np.sum((held @ inverse[-1]) ** 2)))
+    sigma = float(np.sqrt(max(alone, alike) + np.sum((held @ inverse[-1]) ** 2)))
+    return sigma, float(len(residuals) - leverage.sum())

@@ -5,8 +5,8 @@ parts from what one sees with the projector. Unknown are the errors of all calib
 the covariance of both as their prior. They are measured by fringes on the skin that both cameras see, and by views of the target
 in both; a ball bar tells the scale. What these leave open, such as a motion of all devices alike, keeps its prior.
 
-The size of the usual drift is a guess, to within a factor of two. Corrections are averaged over sizes as likely as the session
-makes them (MacKay 1992, Bayesian interpolation); beyond a limit a device was rather pushed.
+The size of the usual drift is a guess. Where a session shows more, the prior of drift, not that of the calibration, grows to the
+size of greatest evidence (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was rather pushed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.special import softmax
 
 from recon.estimation.covariance import root
 from recon.geometry import rigid
@@ -34,8 +33,8 @@ Array = NDArray[np.float64]
 
 TURN_PER_PX, SHIFT_PER_PX = 3e-4, 0.2  # rad and mm of a mount for each px of drift; assumed: 15 urad and 10 um for 0.05 px
 SIZES = 2.0 ** (np.arange(17) / 4)  # of drift over the usual one, that are compared
-GUESSED = 2.0  # factor to which the usual drift is known, 1 sigma
 LARGEST = 8.0  # of these, that is still drift: 0.4 px
+SURE_SIGMA = 3.0  # of surprise, below which a session shows usual drift, whatever size is the likeliest: evidence may be flat
 ROUNDS = 3  # of linearising anew: a drift of a tenth of a pixel is all but linear
 
 
@@ -76,8 +75,18 @@ class Drift:
     before: Calibration
     prior: Uncertainty  # of the calibration as it was, after drift of the size below
     after: Calibration  # with the covariance that is left
-    size: float  # of drift over the usual one: the median
+    size: float  # of drift over the usual one, the likeliest
     surprise: float  # standard deviations of a normal number as unlikely as what the session shows, by usual drift
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether the session shows usual drift, or less."""
+        return self.surprise < SURE_SIGMA
+
+    @property
+    def is_push(self) -> bool:
+        """Whether a device moved by more than drift."""
+        return self.size > LARGEST and not self.is_usual
 
 
 def estimate(
@@ -108,19 +117,16 @@ def estimate(
     priors = {float(size): block_diag(root(fixed + size**2 * drifting), lengths) for size in SIZES}
 
     def solve(step: Array) -> tuple[Array, Array, float, Evidence]:
-        """The next step from the calibration, its covariance, and the median size of drift."""
+        """The next step from the calibration, its covariance, and the likeliest size of drift."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
         if bars is not None:
             certified = ball_bar.equations(bars, cameras, names, len(lengths))
             rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        chances = softmax([seen.logarithm(prior) - 0.5 * (np.log(size) / np.log(GUESSED)) ** 2 for size, prior in priors.items()])
-        means, within = (np.stack(each) for each in zip(*map(seen.posterior, priors.values()), strict=True))
-        mean = chances @ means
-        covariance = np.tensordot(chances, within, 1) + (means - mean).T @ (chances[:, None] * (means - mean))
-        size = SIZES[np.searchsorted(np.cumsum(chances), 0.5)]
-        return mean[: len(names)], covariance[: len(names), : len(names)], float(size), seen
+        size = max(priors, key=lambda size: seen.logarithm(priors[size]))
+        mean, covariance = seen.posterior(priors[size])
+        return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
 
     step, left, size, seen = solve(np.zeros(len(names)))
     for _ in range(ROUNDS - 1):

@@ -8,6 +8,7 @@ far beside it in the other camera.
 
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,7 +34,8 @@ def _quadric(x: Array, y: Array) -> Array:
 
 ACROSS, DOWN = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1.0),)))  # px, of a window's pixels
 QUADRIC = _quadric(ACROSS, DOWN)
-WINDOW_NOISE = float(np.linalg.norm(np.linalg.pinv(QUADRIC)[0]))  # of a window's middle, for 1 of each pixel
+FIT = np.linalg.pinv(QUADRIC)
+WINDOW_NOISE = float(np.linalg.norm(FIT[0]))  # of a window's middle, for 1 of each pixel
 
 
 def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera], rng: np.random.Generator, name: str) -> Matches:
@@ -53,8 +55,7 @@ def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera]
     if not axes:
         raise InputError(f"{name}: expected both cameras' images of one sequence, found no axis of the projector in both")
     values, sigmas = ([[camera[k][part] for k in axes] for camera in layers] for part in (0, 1))
-    middles = np.argwhere(np.isfinite(values[0]).all(axis=0)[HALF :: 2 * HALF + 1, HALF :: 2 * HALF + 1])  # no pixel twice
-    pixels = HALF + (2 * HALF + 1.0) * rng.permutation(middles)[: CANDIDATES * MOST, ::-1]
+    pixels = rng.permutation(_raster(np.isfinite(values[0]).all(axis=0)))[: CANDIDATES * MOST].astype(float)
     first, _, _, first_sigma = _read(values[0], sigmas[0], pixels)
     good = np.isfinite(first).all(axis=1)
     pixels, first, first_sigma = pixels[good], first[good], first_sigma[good]
@@ -62,10 +63,19 @@ def match(maps: tuple[ProjectorMap, ProjectorMap], cameras: Mapping[str, Camera]
     second, gradient, bend, second_sigma = _read(values[1], sigmas[1], seen_at)
     both = np.flatnonzero(np.isfinite(second).all(axis=1))[:MOST]
     if len(both) < LEAST:
-        found = f"{len(both)}: a smooth thing in the middle of both views, or {' and '.join(CAMERAS)} under other names?"
-        raise InputError(f"{name}: expected {LEAST} points that both cameras see under the {PROJECTOR}'s fringes, found {found}")
+        expected = f"expected {LEAST} points that both cameras see under the {PROJECTOR}'s fringes, found {len(both)}"
+        cause = f"a smooth thing, of 50 x 50 px or more, in both views, or {' and '.join(CAMERAS)} under other names?"
+        raise InputError(f"{name}: {expected}: {cause}")
     sigma = np.stack([first_sigma, second_sigma], axis=1)
     return Matches(pixels, first, seen_at, second, gradient, bend, sigma, axes).some(both)
+
+
+def _raster(seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Middles : (m, 2) px of windows that share no pixel and lie in a mask : (h, w), on the raster that holds most of them."""
+    side = 2 * HALF + 1
+    whole = cv2.erode(seen.astype(np.uint8), np.ones((side, side), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    down, across = max(np.ndindex(side, side), key=lambda start: np.count_nonzero(whole[start[0] :: side, start[1] :: side]))
+    return side * np.argwhere(whole[down::side, across::side])[:, ::-1] + [across, down]
 
 
 def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) -> tuple[Array, Array, Array, Array]:
@@ -82,12 +92,14 @@ def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) ->
     values, gradients, bends, noises = [], [], [], []
     for layer, sigma in zip(layers, sigmas, strict=True):
         window = layer[rows, columns].astype(float)
-        found = window @ np.linalg.pinv(QUADRIC).T
+        found = window @ FIT.T
         left = window - found @ QUADRIC.T
         with np.errstate(invalid="ignore"):
             flat = inside & (np.abs(left).max(axis=1) < FLAT_PX)
         bend = found[:, [[3, 4], [4, 5]]] * [[2, 1], [1, 2]]
-        claimed = np.sqrt(np.mean(left**2, axis=1)) if sigma is None else sigma[rows, columns].mean(axis=1)
+        claimed = (
+            np.sqrt(np.sum(left**2, axis=1) / (len(QUADRIC) - len(FIT))) if sigma is None else sigma[rows, columns].mean(axis=1)
+        )
         values.append(np.where(flat, np.einsum("mi,mi->m", found, _quadric(*aside.T)), np.nan))
         gradients.append(found[:, 1:3] + np.einsum("mij,mj->mi", bend, aside))
         bends.append(bend)

@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 CAMERAS, PROJECTOR, TARGET = ("cam1", "cam2"), "projector", "target"
 USUAL_MOTION = np.repeat([np.deg2rad(0.03), 0.1], 3)  # rad and mm: a mount that creeps, a touch; larger ones show all the better
 USUAL_LENGTH = 0.3  # mm: another print, a bent board
+BEND_PX = 3.0  # from where a map is read, to which its bend is continued: beyond, its noise is
 EXACT_PX = 1e-4  # of a camera's pixel at which a map is read
 RULES = Rules(damping=0, rounding=1e-6, converged=0, steps=3)  # of a pose's fit, from where rays meet
 OUTLYING = 5.0  # standard deviations, after the scale of all
@@ -117,7 +118,8 @@ def of_fringes(matches: Matches, cameras: Mapping[str, Camera], target: Target, 
     points = points_by_light(matches.pixels, matches.first, matches.axes, cameras)
     first, second, light = (linearise(cameras, name, points, names) for name in (*CAMERAS, PROJECTOR))
     shown, aside, rows = light.pixels[:, axes], second.pixels - matches.seen_at, []
-    bent = np.einsum("mkij,mj->mki", matches.bend, aside)
+    near = np.minimum(1, BEND_PX / np.maximum(np.linalg.norm(aside, axis=1), EXACT_PX))
+    bent = np.einsum("mkij,mj,m->mki", matches.bend, aside, near**2)
     for by_first, by_second, by_light in (
         (first.by_point, second.by_point, light.by_point[:, axes]),
         (first.by_parameter, second.by_parameter, light.by_parameter[:, axes]),

@@ -24,7 +24,7 @@ from recon.reports import page
 from recon.reports.page import Opening, Section
 from recon.rig_check import ball_bar, drift, fringe_matches
 from recon.rig_check.ball_bar import Bars
-from recon.rig_check.drift import GUESSED, LARGEST, Drift
+from recon.rig_check.drift import LARGEST, Drift
 from recon.rig_check.optics_equations import PROJECTOR, Matches, points_by_light
 from recon.session import poses_step
 from recon.session.settings import BarFields
@@ -74,11 +74,6 @@ class Corrected:
         """The corrected one; without a covariance where it had none, by which single errors would count as known."""
         return replace(self.drift.after, uncertainty=self.drift.after.uncertainty if self.drift.before.uncertainty else None)
 
-    @property
-    def is_drift(self) -> bool:
-        """Whether no device moved by more than drift."""
-        return self.drift.size <= LARGEST
-
     def beyond(self, drift_px: float) -> str:
         """A fault: more than drift."""
         expected = f"expected devices that drifted by some {drift_px:g} px since their calibration"
@@ -110,7 +105,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     bars = find_bars(settings, file, calibration, watch)
     with watch.busy("estimating the drift"):
         found = correct(calibration, matches, film, target_of(settings), settings, bars)
-    if not found.is_drift:
+    if found.drift.is_push:
         raise InputError(f"{settings.capture}: {found.beyond(settings.drift_px)}")
     for line in describe(found):
         watch.say(line)
@@ -293,7 +288,7 @@ def changes(found: Drift) -> dict[str, tuple[float, float]]:
 
 def describe(found: Corrected) -> Iterator[str]:
     """Lines: how much drifted, and what it would have cost."""
-    size = "as usual" if found.drift.size < GUESSED else f"{found.drift.size:.1f} times the usual"
+    size = "as usual" if found.drift.is_usual else f"{found.drift.size:.1f} times the usual"
     yield f"drift       {size} ({found.drift.surprise:.1f} sigma by usual drift)"
     told = changes(found.drift)
     for device in found.drift.after.cameras:
@@ -323,7 +318,7 @@ def write_page(found: Corrected, name: str) -> str:
     lines = [page.paragraph(line) for line in READING]
     sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
     figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
-    usual = found.drift.size < GUESSED
+    usual = found.drift.is_usual
     result = "Devices drifted as usual, or less." if usual else f"Devices drifted {found.drift.size:.1f} times as far as usual."
     if "skin_moved_mm" in found.figures:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]

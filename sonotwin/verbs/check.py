@@ -184,7 +184,7 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
     corrected = drift_step.correct(calibration, matches, film or (), target, config)
     for line in drift_step.describe(corrected):
         watch.say(line)
-    if not corrected.is_drift:
+    if corrected.drift.is_push:
         watch.say(f"warning     not corrected: {corrected.beyond(config.drift_px)}")
         return found, None
     return found, corrected.calibration

@@ -189,6 +189,24 @@ def test_depths_of_another_motion_are_refused(rng):
     refused("follow the probe's height", height, lambda t: rng.standard_normal(len(t)))
 
 
+def test_tilts_do_not_explain_depths_of_another_motion():
+    """A hand that tilts by 4 deg has up to fifteen slopes; of 20 sweeps with 12 mm of another motion one may look like a lag."""
+    refused = 0
+    for seed in range(20):
+        rng, t = np.random.default_rng(seed), np.arange(0, 6, 0.025)
+        paces, begins = rng.uniform(0.3, 1.0, (5, 1)), rng.uniform(0, 2 * np.pi, (5, 1))
+        swings = np.sin(2 * np.pi * paces * t + begins)
+        turns = Rotation.from_rotvec(np.deg2rad(4 * swings[:3].T))
+        targets = np.column_stack([0 * t, 0 * t, height(t)]) - turns.apply([10, 120, -20])
+        poses = np.array([rigid.transform(*each) for each in zip(turns.as_matrix(), targets, strict=True)])
+        depths = (60 - height(t) + 12 * swings[3] + 6 * swings[4]) / bscans.MM_PER_PX
+        try:
+            latency.estimate(nanoseconds(t[::2] + 0.05), depths[::2], Track(nanoseconds(t), poses))
+        except InputError:
+            refused += 1
+    assert refused >= 18
+
+
 def test_a_lag_outside_the_search_is_refused():
     refused("lag within -0.1 to 0.1 s", height, lambda t: height(t - 0.15), (-0.1, 0.1))
 

@@ -34,7 +34,7 @@ def matched(cameras, radius_mm: float, sigma_px: float, rng: np.random.Generator
 
 
 def test_a_small_dark_thing_shows_no_drift_that_is_none(rig, rng):
-    """Windows share no pixel, and in ten captures none shows more than noise; overlapping ones would count it many times."""
+    """Windows share no pixel of camera 1, and of ten captures none shows more than noise, which overlapping ones count anew."""
     known = calibration_of(rig)
     for _ in range(10):
         matches = matched(known.cameras, 1e4, 0.06, rng)
@@ -52,3 +52,29 @@ def test_a_curved_surface_is_read_on_itself(rig, rng, radius_mm):
     names = optics_equations.parameters(drift.usual_drift(known.cameras, calibration.DRIFT_PX), list(known.cameras))
     left = optics_equations.of_fringes(matches, known.cameras, rig.target, names).residuals
     assert np.abs(left).max() < 0.05
+
+
+def test_points_that_moved_are_read_where_they_are_now(rig, rng):
+    """Camera 2 is off by 2 px: by the true cameras residuals are noise; a map's gradient alone would leave one sigma."""
+    known = calibration_of(rig).cameras
+    true = calibration.moved(known, ("cam2.cx",), np.array([2.0]))
+    maps = tuple(seen(true, name, 19.8, 0.02, rng) for name in ("cam1", "cam2"))
+    matches = fringe_matches.match(maps, known, rng, "sphere")
+    names = optics_equations.parameters(drift.usual_drift(known, calibration.DRIFT_PX), list(known))
+    left, straight = (
+        optics_equations.of_fringes(each, true, rig.target, names).residuals
+        for each in (matches, matches._replace(bend=0 * matches.bend))
+    )
+    assert abs(np.mean(left)) < 0.3 < abs(np.mean(straight))
+
+
+def test_a_narrow_strip_is_matched_wherever_it_lies(rig, rng):
+    """21 columns hold three windows side by side, on whatever raster they lie."""
+    known = calibration_of(rig).cameras
+    counts = []
+    for shift in range(7):
+        maps = [seen(known, name, 1e4, 0.02, rng) for name in ("cam1", "cam2")]
+        first = np.flatnonzero(np.isfinite(maps[0].columns).any(axis=0))[0] + shift
+        maps[0].columns[:, :first], maps[0].columns[:, first + 21 :] = np.nan, np.nan
+        counts.append(len(fringe_matches.match(tuple(maps), known, rng, "strip").pixels))
+    assert min(counts) >= 30
