@@ -63,12 +63,10 @@ def sessions(setup: Setup, conditions: str, known: str = USUAL, seeds: Sequence[
         raise InputError(
             f"accuracy: known: expected one of {', '.join(KNOWN[conditions])} of {conditions} sessions, found {known}"
         )
-    own = f"{known}_"
-    found = [measured(setup.out, conditions, seed) for seed in seeds]
-    return together([{name.removeprefix(own): one[name] for name in one if name.startswith(own)} for one in found])
+    return together([measured(setup.out, conditions, known, seed) for seed in seeds])
 
 
-def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
+def measured(out: Path | None, conditions: str, known: str, seed: int) -> Metrics:
     """Figures of one session, by estimated calibrations and tracked poses; those kept in a folder, if they are of this code.
 
     Raises
@@ -76,27 +74,30 @@ def measured(out: Path | None, conditions: str, seed: int) -> Metrics:
     InputError
         If code or settings were edited since this run took their digest, by which figures are kept.
     """
-    kept, key = None if out is None else Kept(out / "session"), f"{conditions}_{seed}_{code()}"
-    if kept is not None and (found := kept.read(key)) is not None:
-        return found
+    kept = None if out is None else Kept(out / "session")
+    keys = {each: f"{conditions}_{each}_{seed}_{code()}" for each in KNOWN[conditions]}
+    if kept is not None and (there := kept.read(keys[known])) is not None:
+        return there
     work = Path(mkdtemp(prefix="session"))
     try:
-        whole, figures = session(work, conditions, seed)
+        found = session(work, conditions, seed)
     finally:
         shutil.rmtree(work)
+    whole = {each: figures for each, (is_whole, figures) in found.items() if is_whole}
     if kept is not None and whole:
         if not is_unchanged(*PACKAGES, config.folder()):
             expected = "expected code and conf/ as they were when the run began, found them edited meanwhile"
             raise InputError(f"accuracy: {expected}; start it again, in a copy if you go on editing; what was kept before stays")
         kept.open()
-        kept.keep(key, figures)
-    return figures
+        for each, figures in whole.items():
+            kept.keep(keys[each], figures)
+    return found[known][1]
 
 
-def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
+def session(work: Path, conditions: str, seed: int) -> dict[str, tuple[bool, Metrics]]:
     """Render a session and the cylinders, take their truth away, reconstruct both by all that a lab may know, and compare.
 
-    Returns whether all steps were done, and the figures, each with the name of what is known before its own.
+    Returns, by what is known, whether all steps were done, and the figures.
     """
     chosen, captures = settings(conditions, seed), {name: work / name / "session" for name in ("scan", "cylinders")}
     for part in rendered_session.parts(chosen, captures["scan"], BOTTOM_HZ):
@@ -104,20 +105,19 @@ def session(work: Path, conditions: str, seed: int) -> tuple[bool, Metrics]:
     for part in rendered_session.cylinders(chosen, captures["cylinders"]):
         part.run()
     truths = {name: (folder / "truth").rename(work / name / "truth") for name, folder in captures.items()}
-    whole, figures = True, {}
+    found = {}
     for known in KNOWN[conditions]:
         by = reconstruction(chosen, BOARD_SCALE[conditions], captures["scan"], work / "scan" / known)
         if known == CERTIFIED:
             by = certified(by, chosen, truths["scan"])
         status = reconstruct.run(by)
-        found = session_errors.measure(by.out, captures["scan"] / "capture", truths["scan"])
+        figures = session_errors.measure(by.out, captures["scan"] / "capture", truths["scan"])
         if status == 0:
             in_tank = of_cylinders(by, captures["cylinders"], work / "cylinders" / known)
             status = reconstruct.run(in_tank)
-            found |= {} if status else session_errors.cylinders(in_tank.out, truths["cylinders"], TUBE)
-        whole &= status == 0
-        figures |= {f"{known}_{name}": value for name, value in found.items()}
-    return whole, figures
+            figures |= {} if status else session_errors.cylinders(in_tank.out, truths["cylinders"], TUBE)
+        found[known] = status == 0, figures
+    return found
 
 
 def settings(conditions: str, seed: int) -> Settings:

@@ -89,32 +89,36 @@ def test_a_missed_mass_fails_its_rows():
     )
 
 
+def made_of(value: float, whole: bool = True) -> dict[str, tuple[bool, dict]]:
+    """What a session gives: the reconstruction by the usual may have failed, that by what is certified hasn't."""
+    return {"usual": (whole, {"figure": value}), "certified": (True, {"figure": -value})}
+
+
 @pytest.mark.parametrize(("whole", "times"), [(True, 1), (False, 2)])
 def test_what_was_measured_is_kept_if_no_step_failed(tmp_path, monkeypatch, whole, times):
+    """Of both reconstructions of a session each by itself."""
     made = []
-    monkeypatch.setattr(
-        session_accuracy, "session", lambda work, kind, seed: made.append(seed) or (whole, {"figure": float(seed)})
-    )
-    for _ in range(2):
-        assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 7.0}
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: made.append(seed) or made_of(float(seed), whole))
+    for known, figure in (("usual", 7.0), ("certified", -7.0), ("usual", 7.0)):
+        assert session_accuracy.measured(tmp_path, "lifelike", known, 7) == {"figure": figure}
     assert made == [7] * times
 
 
 def test_figures_of_other_code_are_not_used(tmp_path, monkeypatch):
-    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: (True, {"figure": 1.0}))
-    session_accuracy.measured(tmp_path, "ideal", 7)
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: made_of(1.0))
+    session_accuracy.measured(tmp_path, "lifelike", "usual", 7)
     monkeypatch.setattr(session_accuracy, "code", lambda: "other")
-    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: (True, {"figure": 2.0}))
-    assert session_accuracy.measured(tmp_path, "ideal", 7) == {"figure": 2.0}
+    monkeypatch.setattr(session_accuracy, "session", lambda work, kind, seed: made_of(2.0))
+    assert session_accuracy.measured(tmp_path, "lifelike", "usual", 7) == {"figure": 2.0}
 
 
 def test_figures_are_not_kept_of_code_that_was_edited_meanwhile(tmp_path, monkeypatch):
     """Steps import late, so nobody can say which code they were of."""
     (code := tmp_path / "code").mkdir()
     monkeypatch.setattr(session_accuracy, "PACKAGES", (code,))
-    monkeypatch.setattr(session_accuracy, "session", lambda *of: (code / "a.py").write_text("") or (True, {"figure": 1.0}))
+    monkeypatch.setattr(session_accuracy, "session", lambda *of: (code / "a.py").write_text("") or made_of(1.0))
     with pytest.raises(InputError, match="accuracy: expected code and conf/ as they were when the run began"):
-        session_accuracy.measured(tmp_path / "out", "ideal", 7)
+        session_accuracy.measured(tmp_path / "out", "lifelike", "usual", 7)
     assert not list(tmp_path.glob("out/**/*.json"))
 
 
@@ -128,8 +132,7 @@ def test_rows_are_of_what_the_lab_knew(rig, monkeypatch):
     """A session's figures are kept by what was known, and a row takes its own; none of what no session was reconstructed by."""
     monkeypatch.setattr(session_accuracy, "read_rig", lambda name: rig)
     known = {"usual": figures(scan_track_shift_median_mm=0.3), "certified": figures(scan_track_shift_median_mm=0.05)}
-    kept = {f"{name}_{key}": value for name, one in known.items() for key, value in one.items()}
-    monkeypatch.setattr(session_accuracy, "measured", lambda out, conditions, seed: kept)
+    monkeypatch.setattr(session_accuracy, "measured", lambda out, conditions, name, seed: known[name])
     for name, shift in (("usual", 0.3), ("certified", 0.05)):
         found = session_accuracy.sessions(Setup(rig), "lifelike", name)
         assert found["shift_mm"] == shift and found["sessions"] == len(session_accuracy.SEEDS)
