@@ -111,7 +111,7 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None, imp
     root, entry = folder / read.root, manifest.field_of(place)
     for field, found, way in (
         (f"images.{SCANNER}", part.images.get(SCANNER), ""),
-        ("track", part.track, "; find the poses by `sonotwin track` first, and give its folder"),
+        ("track", part.track, "; find the poses by `sonotwin track` first, and give its folder as the capture"),
     ):
         if found is None:
             raise InputError(f"{folder / MANIFEST}: {entry}.{field}: expected a path, found none{way}")

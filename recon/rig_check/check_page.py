@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import datetime, timedelta
+from math import erfc
 from typing import NamedTuple
 
 from matplotlib import dates, ticker
@@ -51,20 +52,23 @@ def write_text(made: Check, log: Sequence[Check], alarm_sigma: float) -> str:
     sections = [
         Section("Parts", [page.table(("part", "verdict", "motion", "limit, 1 σ", "deviation", "in mm"), map(_row, made.parts))]),
         Section("Over the days", _course(log, alarm_sigma)),
-        Section("How to read this", [page.paragraph(text) for text in READING]),
+        Section("How to read this", [page.paragraph(text) for text in reading(alarm_sigma)]),
     ]
     return page.render(Opening("Check of the rig", made.name, summary(made.parts), _figures(made)), sections, FOOTER)
 
 
-READING = (
-    "A part has moved where its deviation, had nothing moved, would come by chance in one check of two thousand. Where another "
-    "part explains the measurements as well, both are named.",
-    "The limit is that of this check, not an error of the deviation beside it: one standard deviation of the motions that the "
-    "recording leaves possible, whatever was found. Motions below some of these pass unseen. A part is open where the limit is "
-    "nearly a usual motion, or where cameras that moved have tracked it.",
-    "Motions of all devices together, a projector's along its fringes, and a probe's along its own depth do not show. The first "
-    "two do no harm; the third the crossed wires show.",
-)
+def reading(alarm_sigma: float) -> tuple[str, ...]:
+    """What the numbers mean."""
+    by_chance = 1 / erfc(alarm_sigma / 2**0.5)
+    return (
+        f"A part has moved where its deviation, had nothing moved, would come by chance in one check of {by_chance:.0f}. Where "
+        "another part explains the measurements as well, both are named.",
+        "The limit is that of this check, not an error of the deviation beside it: one standard deviation of the motions that "
+        "the recording leaves possible, whatever was found. Motions below some of these pass unseen. A part is open where the "
+        "limit is nearly a usual motion, or where cameras that moved have tracked it.",
+        "Motions of all devices together, a projector's along its fringes, and a probe's along its own depth do not show. The "
+        "first two do no harm; the third the crossed wires show.",
+    )
 
 
 def summary(parts: Sequence[Entry]) -> str:
@@ -73,9 +77,9 @@ def summary(parts: Sequence[Entry]) -> str:
     if moved:
         named = ", ".join(" or ".join(TITLES[name] for name in (one.part, *one.rivals)) for one in moved)
         return f"Moved: {named}. Run {', '.join(anew(parts))}."
-    if checked := [TITLES[one.part] for one in parts if one.state == "good"]:
-        return f"As calibrated: {', '.join(checked)}."
-    return "Nothing could be checked."
+    names = {state: ", ".join(TITLES[one.part] for one in parts if one.state == state) for state in ("good", "open")}
+    told = [f"{word}: {names[state]}." for state, word in (("good", "As calibrated"), ("open", "Open")) if names[state]]
+    return " ".join(told) or "Nothing could be checked."
 
 
 def anew(parts: Sequence[Entry]) -> list[str]:

@@ -290,6 +290,9 @@ def describe(found: Corrected) -> Iterator[str]:
     """Lines: how much drifted, and what it would have cost."""
     size = "as usual" if found.drift.is_usual else f"{found.drift.size:.1f} times the usual"
     yield f"drift       {size} ({found.drift.surprise:.1f} sigma by usual drift)"
+    if not found.drift.is_usual:
+        cause = "was a device touched? `sonotwin check` tests each; a motion of all alike shows nowhere"
+        yield f"warning     more than usual drift: {cause}"
     told = changes(found.drift)
     for device in found.drift.after.cameras:
         (x, x_sigma), (y, y_sigma) = (told[f"{device}.{name}"] for name in ("cx", "cy"))

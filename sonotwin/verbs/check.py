@@ -40,6 +40,8 @@ from sonotwin.console_watch import ConsoleWatch
 CHECK, PAGE = "check.json", "check.html"
 UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
 LEAST_POSES = 3
+MOSTLY = 0.5  # share of B-scans that should show the bottom
+FAR_MM = 2.0  # of a motion, beyond which equations are far from linear
 
 
 class Config(MeasuredTargetFields):
@@ -106,6 +108,9 @@ def run(config: Config) -> int:
     made = check_log.check(listed.name or config.capture.resolve().name, found)
     for line in check_page.lines(made):
         watch.say(line)
+    if any(one.state == "moved" and one.mm > FAR_MM for one in devices):
+        cause = "is it this rig's calibration, and are the images each camera's own?"
+        watch.say(f"warning     motions of {FAR_MM:g} mm and more are told roughly, and others may be named for them: {cause}")
     watch.say(f"verdict     {check_page.summary(made.parts)}")
     with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
@@ -202,6 +207,7 @@ def filmed(
     poses = target_poses.spread(target_poses.evenly_lit(collected.seen, LEAST_POSES), config.most_poses)
     if len(poses) < LEAST_POSES:
         found = f"{len(poses)} in {len(film.times)} pairs{collected.told}: move it about, clean, uncovered and well lit"
+        found += "; or is the calibration another rig's, or a camera far from where it was?"
         raise InputError(f"{film.name}: expected {LEAST_POSES} poses in which both cameras see all circles whole, found {found}")
     tilt, reach = target_poses.tilt_deg(poses), target_poses.range_mm(poses)
     watch.say(f"film        {len(poses)} poses, tilts of {tilt:.0f} deg (1 sigma), over {reach:.0f} mm of depth")
@@ -213,22 +219,25 @@ def filmed(
 def tank(config: Config, held: Held, watch: ConsoleWatch) -> list[Verdict]:
     """Verdicts on probe and clock."""
     parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
+    lag = None if config.lag is None else lag_files.read(config.lag)
+    given = None if config.probe is None else probe_files.read(config.probe)
     if held.bottom is None:
         return [Verdict(part, "unseen") for part in parts]
     sweep = sweep_part.read_sweep(config.tracked or config.capture, held.bottom, implausible=config.implausible)
-    probe = sweep.probe if config.probe is None else probe_files.read(config.probe)
+    probe = given or sweep.probe
     if probe is None:
         raise InputError(
             f"{config.capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe"
         )
     if probe.uncertainty is None:
         watch.say("warning     probe: no covariance: an error of its calibration is taken for a bent bracket")
-    lag = None if config.lag is None else lag_files.read(config.lag)
     known = Known(in_water(probe, config), *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)))
     lines = bottom_equations.lines_of(sweep.images(), sweep.times, sweep.size, config.top_px)
     found, lag_s = verdicts.of_bottom(lines, sweep.track, known, sweep.size, config.speed_mm_s, config.alarm_sigma)
     shown = int(np.isfinite(lines.pixels).all(axis=(1, 2)).sum())
     watch.say(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms")
+    if shown < MOSTLY * min(len(sweep.times), bottom_equations.MOST):
+        watch.say(f"warning     {sweep.name}: most B-scans show no bottom: is it a sweep over a tank's?")
     return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
 
 

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,16 +10,18 @@ import pytest
 from recon.capture import calibration_files, lag_files, probe_files
 from recon.capture.lag_files import LagFile
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty
+from recon.model.calibration import Calibration, Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.sound_in_water import speed_of_sound
 from scenes.board_poses import Config as Poses
 from sonotwin.cli import main
 from tests.recon import bscans, sweep_sets
+from tests.recon.tracking import films
 from tests.twin.parting import parted_mm
 from tests.twin.small_rigs import half, half_as_fields
 from twin.conditions import IDEAL
 from twin.experiments.drawn_session import Noise, calibrated_optics
+from twin.optics.surface_session import calibration_of
 
 LAG_S = 0.0473
 
@@ -91,6 +94,20 @@ def test_poses_of_the_bottom_may_be_in_track_s_folder(bottom, tmp_path, capsys):
     files = [f"tracked={bottom / 'capture'}", f"probe={tmp_path / 'probe.yaml'}", f"lag={bottom / 'lag.json'}"]
     main([*line, *files])
     assert "film=NAME" in (said := capsys.readouterr().out) and "bottom      in" in said
+
+
+def test_a_film_by_another_rig_s_calibration_is_not_called_dirty_only(rig, tmp_path, capsys):
+    """Camera 2 is turned by 3 deg: no pose fits both views. A file that isn't there is named, whatever is checked."""
+    films.film(tmp_path / "film", rig, np.random.default_rng(4), count=6)
+    cameras = calibration_of(rig).cameras
+    turn = rigid.from_rotation_vector(np.deg2rad([0, 3, 0]), np.zeros(3))
+    other = {**cameras, "cam2": replace(cameras["cam2"], camera_from_world=turn @ cameras["cam2"].camera_from_world)}
+    calibration_files.write(tmp_path / "other.yaml", Calibration({name: other[name] for name in ("cam1", "cam2")}))
+    line = ["check", f"capture={tmp_path / 'film'}", f"out={tmp_path / 'out'}"]
+    assert main([*line, f"calibration={tmp_path / 'other.yaml'}"]) == 2
+    assert "or is the calibration another rig's" in capsys.readouterr().err
+    assert main([*line, f"lag={tmp_path / 'none.json'}"]) == 2
+    assert "none.json: expected a file, found none" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it

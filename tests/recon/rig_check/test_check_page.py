@@ -27,6 +27,14 @@ def test_the_page_says_what_moved_and_what_to_do():
     assert "0.982\u00a0mm" in text and "0.112\u00a0mm" in text and "±" not in text
 
 
+def test_parts_that_stay_open_are_in_the_verdict_and_chance_is_that_of_the_limit():
+    seen = [Verdict("cam1", "good", 0.5, 0.01, 0.02), Verdict("probe", "open", 0.4, 0.2, 0.4)]
+    log = checks((0,), seen)
+    assert "As calibrated: camera 1. Open: probe on its bracket." in check_page.write_text(log[0], log, 3.5)
+    for alarm_sigma, number in ((3.5, "2149"), (3.2, "728")):
+        assert f"in one check of {number}." in check_page.write_text(log[0], log, alarm_sigma)
+
+
 def test_a_page_of_parts_that_nothing_showed():
     made = check_log.check("x", [Verdict("probe", "unseen")])
     assert "Nothing could be checked." in check_page.write_text(made, [made], 3.5)
