@@ -5,8 +5,9 @@ parts from what one sees with the projector. Unknown are the errors of all calib
 the covariance of both as their prior. They are measured by fringes on the skin that both cameras see, and by views of the target
 in both; a ball bar tells the scale. What these leave open, such as a motion of all devices alike, keeps its prior.
 
-The size of the usual drift is a guess. Where a session shows more, the prior of drift, not that of the calibration, grows to the
-size of greatest evidence (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was rather pushed.
+The size of the usual drift is a guess. Where a session surely shows more, the prior of drift, not that of the calibration, grows
+to the size of greatest evidence (MacKay 1992, Bayesian interpolation), up to a limit beyond which a device was rather pushed. A
+session that usual drift explains says little of the size: its evidence is flat, and a map's small errors may tip it anywhere.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,7 @@ Array = NDArray[np.float64]
 TURN_PER_PX, SHIFT_PER_PX = 3e-4, 0.2  # rad and mm of a mount for each px of drift; assumed: 15 urad and 10 um for 0.05 px
 SIZES = 2.0 ** (np.arange(17) / 4)  # of drift over the usual one, that are compared
 LARGEST = 8.0  # of these, that is still drift: 0.4 px
-SURE_SIGMA = 3.0  # of surprise, below which a session shows usual drift, whatever size is the likeliest: evidence may be flat
+SURE_SIGMA = 3.0  # of surprise, from which on a session surely shows more than usual drift
 ROUNDS = 3  # of linearising anew: a drift of a tenth of a pixel is all but linear
 
 
@@ -56,7 +57,8 @@ class Evidence(NamedTuple):
         """Mean : (g + l,) and covariance : (g + l, g + l) of the unknowns."""
         inner = self.slopes @ prior
         within = np.linalg.inv(np.eye(inner.shape[1]) + inner.T @ inner)
-        return prior @ (within @ (inner.T @ self.left)), prior @ within @ prior.T
+        covariance = prior @ within @ prior.T
+        return prior @ (within @ (inner.T @ self.left)), (covariance + covariance.T) / 2
 
     def surprise(self, prior: Array) -> float:
         """Standard deviations of a normal number as unlikely as what is measured, by what the prior shows above noise."""
@@ -75,18 +77,8 @@ class Drift:
     before: Calibration
     prior: Uncertainty  # of the calibration as it was, after drift of the size below
     after: Calibration  # with the covariance that is left
-    size: float  # of drift over the usual one, the likeliest
+    size: float  # of drift over the usual one, 1 where a session shows no more
     surprise: float  # standard deviations of a normal number as unlikely as what the session shows, by usual drift
-
-    @property
-    def is_usual(self) -> bool:
-        """Whether the session shows usual drift, or less."""
-        return self.surprise < SURE_SIGMA
-
-    @property
-    def is_push(self) -> bool:
-        """Whether a device moved by more than drift."""
-        return self.size > LARGEST and not self.is_usual
 
 
 def estimate(
@@ -117,14 +109,15 @@ def estimate(
     priors = {float(size): block_diag(root(fixed + size**2 * drifting), lengths) for size in SIZES}
 
     def solve(step: Array) -> tuple[Array, Array, float, Evidence]:
-        """The next step from the calibration, its covariance, and the likeliest size of drift."""
+        """The next step from the calibration, its covariance, and the size of drift."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
         if bars is not None:
             certified = ball_bar.equations(bars, cameras, names, len(lengths))
             rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        size = max(priors, key=lambda size: seen.logarithm(priors[size]))
+        usual = seen.surprise(priors[1.0]) < SURE_SIGMA
+        size = 1.0 if usual else max(priors, key=lambda size: seen.logarithm(priors[size]))
         mean, covariance = seen.posterior(priors[size])
         return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
 

@@ -105,7 +105,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     bars = find_bars(settings, file, calibration, watch)
     with watch.busy("estimating the drift"):
         found = correct(calibration, matches, film, target_of(settings), settings, bars)
-    if found.drift.is_push:
+    if found.drift.size > LARGEST:
         raise InputError(f"{settings.capture}: {found.beyond(settings.drift_px)}")
     for line in describe(found):
         watch.say(line)
@@ -288,9 +288,9 @@ def changes(found: Drift) -> dict[str, tuple[float, float]]:
 
 def describe(found: Corrected) -> Iterator[str]:
     """Lines: how much drifted, and what it would have cost."""
-    size = "as usual" if found.drift.is_usual else f"{found.drift.size:.1f} times the usual"
+    size = "as usual" if found.drift.size == 1 else f"{found.drift.size:.1f} times the usual"
     yield f"drift       {size} ({found.drift.surprise:.1f} sigma by usual drift)"
-    if not found.drift.is_usual:
+    if found.drift.size > 1:
         cause = "was a device touched? `sonotwin check` tests each; a motion of all alike shows nowhere"
         yield f"warning     more than usual drift: {cause}"
     told = changes(found.drift)
@@ -321,7 +321,7 @@ def write_page(found: Corrected, name: str) -> str:
     lines = [page.paragraph(line) for line in READING]
     sections = [Section("Change since the calibration", blocks), Section("How to read this", lines)]
     figures = [("matched points", str(found.figures["matches"]), ""), ("views of the target", str(found.views), "")]
-    usual = found.drift.is_usual
+    usual = found.drift.size == 1
     result = "Devices drifted as usual, or less." if usual else f"Devices drifted {found.drift.size:.1f} times as far as usual."
     if "skin_moved_mm" in found.figures:
         moved, left = found.figures["skin_moved_mm"], found.figures["skin_sigma_mm"]

@@ -26,7 +26,7 @@ from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
-from recon.rig_check import bottom_equations, check_log, check_page, verdicts
+from recon.rig_check import bottom_equations, check_log, check_page, drift, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR
 from recon.rig_check.verdicts import Optics, Verdict
@@ -189,7 +189,7 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
     corrected = drift_step.correct(calibration, matches, film or (), target, config)
     for line in drift_step.describe(corrected):
         watch.say(line)
-    if corrected.drift.is_push:
+    if corrected.drift.size > drift.LARGEST:
         watch.say(f"warning     not corrected: {corrected.beyond(config.drift_px)}")
         return found, None
     return found, corrected.calibration

@@ -157,7 +157,7 @@ def test_a_small_detector_learns_the_drawn_targets(write, tmp_path):
     The target is far away, all of it within a few cells. c0 and c1 have alike surroundings: to tell them apart by where c2 lies
     takes thousands of steps more. That no augmentation mirrors them, and that labels bear their names, is tested by itself.
     """
-    train, held = split(in_memory(read_views([write(tmp_path / "set", 60, sizes=(1.5, 2.2))])), 0.1)
+    train, held = split(in_memory(read_views([write(tmp_path / "set", 75, sizes=(1.5, 2.2))])), 0.3)
     torch.manual_seed(0)
     asked = plan("detector", 400, batch=16, crop_px=64, learning_rate=8e-3)
     small = Detector(3, 24)
