@@ -42,6 +42,7 @@ def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
     for _ in range(20):
         true = drawn_check.drawn_rig(calibration.cameras, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
         found, matches = corrected(rig, calibration, true, rng)
+        assert (found.after.uncertainty.covariance == found.after.uncertainty.covariance.T).all()
         before.append(apart(calibration.cameras, true, matches)[0])
         left, places = apart(found.after.cameras, true, matches)
         slope = uncertainty.parting(found.after, places, COLUMNS)[:, 2].mean(axis=0)
