@@ -170,8 +170,8 @@ def _mostly(parts: ErrorParts, limit: float) -> str:
     if "calibration" not in parts.parts:
         return f"; their noise is {noise:.3f} mm, where the camera’s alone would leave {alone}"
     moved = parts.parts["calibration"]
-    by = f"; the calibration accounts for {moved.rms_mm:.3f} mm of it, {moved.mean_mm:+.3f} mm in the mean".replace("-", "−")
-    return f"{by}, noise for {noise:.3f} mm, where the camera’s alone would leave {alone}"
+    by = f"; the calibration alone moves it by {moved.rms_mm:.3f} mm, {moved.mean_mm:+.3f} mm in the mean".replace("-", "−")
+    return f"{by}, noise by {noise:.3f} mm, where the camera’s alone would leave {alone}"
 
 
 def surface(measurement: Measurement) -> Section:
