@@ -284,8 +284,8 @@ def _refined(
             raise InputError(f"depths: expected at least {MIN_FRAMES} images that agree on a lag, found {used.sum()}")
         if round_ > 4 and abs(step[-1]) < 1e-7:
             break
-    products = spline(seconds - lag)[:, np.isfinite(sizes)] @ line[1:-1][np.isfinite(sizes)]
-    _agree(predicted - products - trend * line[-1], depths - trend * line[-1], inside, used)
+    without_products = spline(seconds - lag) @ np.where(np.isinf(sizes), line[1:-1], 0)
+    _agree(without_products, depths - trend * line[-1], inside, used)
     sigma, freedom = _sigma(design[used], residuals[used], 1 / variance[used], seconds[used], held)
     if abs(step[-1]) > sigma:
         found = f"it still moving by {1e3 * abs(step[-1]):.1f} ms a round, {lag:.3f} s at last"

@@ -108,28 +108,28 @@ def estimate(
 
     priors = {float(size): block_diag(root(fixed + size**2 * drifting), lengths) for size in SIZES}
 
-    def solve(step: Array) -> tuple[Array, Array, float, Evidence]:
-        """The next step from the calibration, its covariance, and the size of drift."""
+    def solve(step: Array) -> tuple[Array, Array, float, float]:
+        """The next step from the calibration, its covariance, the size of drift, and how surprising it is as usual."""
         cameras = moved(calibration.cameras, names, step)
         rows = measure(cameras, film, matches, target, Uncertainty(names, fixed + drifting))
         if bars is not None:
             certified = ball_bar.equations(bars, cameras, names, len(lengths))
             rows = DeviceRows(*map(np.concatenate, zip(rows, certified, strict=True)))
         seen = reduce(np.column_stack([rows.by_optics, rows.by_length]), rows.residuals + rows.by_optics @ step)
-        usual = seen.surprise(priors[1.0]) < SURE_SIGMA
-        size = 1.0 if usual else max(priors, key=lambda size: seen.logarithm(priors[size]))
+        surprise = seen.surprise(priors[1.0])
+        size = 1.0 if surprise < SURE_SIGMA else max(priors, key=lambda size: seen.logarithm(priors[size]))
         mean, covariance = seen.posterior(priors[size])
-        return mean[: len(names)], covariance[: len(names), : len(names)], size, seen
+        return mean[: len(names)], covariance[: len(names), : len(names)], size, surprise
 
-    step, left, size, seen = solve(np.zeros(len(names)))
+    step, left, size, surprise = solve(np.zeros(len(names)))
     for _ in range(ROUNDS - 1):
-        step, left, size, seen = solve(step)
+        step, left, size, surprise = solve(step)
     free = np.flatnonzero(np.diag(fixed + drifting) > 0)
     before, known = (
         Uncertainty(tuple(names[k] for k in free), each[np.ix_(free, free)], True) for each in (fixed + size**2 * drifting, left)
     )
     after = Calibration(moved(calibration.cameras, names, step), known)
-    return Drift(calibration, before, after, size, seen.surprise(priors[1.0]))
+    return Drift(calibration, before, after, size, surprise)
 
 
 def expected(calibration: Calibration, scale: float | None, drift_px: float) -> Uncertainty:

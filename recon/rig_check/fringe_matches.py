@@ -32,8 +32,8 @@ def _quadric(x: Array, y: Array) -> Array:
     return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
-ACROSS, DOWN = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1.0),)))  # px, of a window's pixels
-QUADRIC = _quadric(ACROSS, DOWN)
+ACROSS, DOWN = (steps.ravel() for steps in np.meshgrid(*2 * (np.arange(-HALF, HALF + 1),)))  # px, of a window's pixels
+QUADRIC = _quadric(ACROSS, DOWN).astype(float)
 FIT = np.linalg.pinv(QUADRIC)
 WINDOW_NOISE = float(np.linalg.norm(FIT[0]))  # of a window's middle, for 1 of each pixel
 
@@ -87,7 +87,7 @@ def _read(layers: list[NDArray], sigmas: list[NDArray | None], places: Array) ->
     with np.errstate(invalid="ignore"):
         inside = ((places >= HALF) & (places <= np.array([width, height]) - 1 - HALF)).all(axis=1)
     middle = np.where(inside[:, None], np.rint(places), HALF).astype(int)
-    columns, rows = middle[:, :1] + ACROSS.astype(int), middle[:, 1:] + DOWN.astype(int)
+    columns, rows = middle[:, :1] + ACROSS, middle[:, 1:] + DOWN
     aside = places - middle
     values, gradients, bends, noises = [], [], [], []
     for layer, sigma in zip(layers, sigmas, strict=True):

@@ -30,7 +30,7 @@ from recon.rig_check import bottom_equations, check_log, check_page, drift, verd
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR
 from recon.rig_check.verdicts import Optics, Verdict
-from recon.session import drift_step, poses_step
+from recon.session import drift_step, latency_step, poses_step
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.target_calibration import target_poses
 from recon.tracking import track_figures
@@ -40,7 +40,6 @@ from sonotwin.console_watch import ConsoleWatch
 CHECK, PAGE = "check.json", "check.html"
 UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
 LEAST_POSES = 3
-MOSTLY = 0.5  # share of B-scans that should show the bottom
 FAR_MM = 2.0  # of a motion, beyond which equations are far from linear
 
 
@@ -236,7 +235,7 @@ def tank(config: Config, held: Held, watch: ConsoleWatch) -> list[Verdict]:
     found, lag_s = verdicts.of_bottom(lines, sweep.track, known, sweep.size, config.speed_mm_s, config.alarm_sigma)
     shown = int(np.isfinite(lines.pixels).all(axis=(1, 2)).sum())
     watch.say(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms")
-    if shown < MOSTLY * min(len(sweep.times), bottom_equations.MOST):
+    if shown < latency_step.MOSTLY * min(len(sweep.times), bottom_equations.MOST):
         watch.say(f"warning     {sweep.name}: most B-scans show no bottom: is it a sweep over a tank's?")
     return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
 

@@ -30,7 +30,7 @@ def test_a_disturbed_plane_is_as_good_as_a_steady_one(rig, monkeypatch):
 def test_skin_costs_modulation_and_nothing_else(rig, monkeypatch):
     """One of the ten breasts with light that spreads and with gel, with the bars of all; without, noise leaves 0.024 mm.
 
-    A pixel takes as many paths as four of the whole camera: with 16 they leave 3 % of the spread by themselves.
+    A pixel takes as many paths as four of the whole camera: with 16 they leave 2 % of the spread by themselves.
     """
     monkeypatch.setattr(reality_accuracy, "SEEDS", range(102, 103))
     monkeypatch.setattr(reality_accuracy, "experiment", partial(experiment, tracing=Tracing(samples=64, room_lux=20)))
