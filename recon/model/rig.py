@@ -4,10 +4,11 @@ World is the frame of camera 1. Every field has a unit; nonsense is refused with
 """
 
 from collections.abc import Iterator
-from itertools import islice
+from itertools import combinations, islice, permutations
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_serializer, model_validator
 
 from recon.errors import InputError
@@ -18,6 +19,9 @@ from recon.model.part import Finite, Fraction, Kinds, NotNegative, Part, Positiv
 
 MOST_CIRCLES = 8  # of a target, by the time that a search takes and the candidates that it has: half a second a window
 LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its circles can be told apart
+LEAST_PARTED_MM = 2.0  # by which distances of three circles of two bodies must differ, that one isn't taken for the other
+PARTED_SIZES = 0.2  # of a diameter, by which circles of two bodies differ that are never taken for each other
+PROBE = "probe"  # name of the body that carries `Rig.target`
 FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
 
 
@@ -160,16 +164,21 @@ class Target(Kinds):
                 raise ValueError(f"{name}: expected {usual}, found {fault} If it is right, give unusual=true with it")
         return self
 
+    @property
+    def places(self) -> NDArray[np.complex128]:
+        """Places : (n,) mm of the circles in their plane, x + i y."""
+        c1, *others = (getattr(self, name) for name in self.LENGTHS)
+        return np.array([0, c1, *map(complex, others[::2], others[1::2])])
+
     @model_validator(mode="after")
     def _names_can_be_told(self) -> Self:
-        c1, *others = (getattr(self, name) for name in self.LENGTHS)
-        if (circles := len(others) // 2 + 2) > MOST_CIRCLES:
+        places = self.places
+        if len(places) > MOST_CIRCLES:
             raise ValueError(
-                f"{self.LENGTHS[-1]}: expected up to {MOST_CIRCLES} circles, found {circles}: the search tries their orders"
+                f"{self.LENGTHS[-1]}: expected up to {MOST_CIRCLES} circles, found {len(places)}: the search tries their orders"
             )
         if self.unusual:
             return self
-        places = np.array([0, c1, *map(complex, others[::2], others[1::2])])
         places = places - places.mean()
         for order in islice(_alike(np.abs(places[:, None] - places)), 1, None):
             turn = np.vdot(places, turned := places[list(order)])
@@ -218,11 +227,54 @@ class Probe(Part):
     target_from_image: Pose
 
 
+def parted_mm(one: Target, other: Target) -> float:
+    """Least difference, mm, by which three circles of one target can't be three of another; infinite if circles' sizes tell them.
+
+    Of each way to take three circles of one for three of the other, both seen from the front, one distance at least differs so.
+    """
+    sizes = one.outer_diameter_mm, other.outer_diameter_mm
+    if max(sizes) > (1 + PARTED_SIZES) * min(sizes):
+        return np.inf
+    least = np.inf
+    for a in combinations(one.places, 3):
+        for b in permutations(other.places, 3):
+            (p, q), (r, s) = np.diff(a), np.diff(b)
+            if np.imag(np.conj(p) * q) * np.imag(np.conj(r) * s) > 0:
+                off = np.abs([p, q, p + q]) - np.abs([r, s, r + s])
+                least = min(least, float(np.abs(off).max()))
+    return least
+
+
+BodyName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+
+
 class Rig(Part):
-    """The whole rig: two cameras, the projector, the target and the probe."""
+    """The whole rig: two cameras, the projector, the probe with its target, and further bodies with a target each."""
 
     cam1: CameraDevice
     cam2: CameraDevice
     projector: ProjectorDevice
     target: Target
     probe: Probe
+    bodies: dict[BodyName, Target] = Field(default_factory=dict)  # such as a needle, or the patient
+
+    @property
+    def targets(self) -> dict[str, Target]:
+        """Targets of all bodies by name, the probe's first."""
+        return {PROBE: self.target, **self.bodies}
+
+    @model_validator(mode="after")
+    def _bodies_can_be_told(self) -> Self:
+        if PROBE in self.bodies:
+            raise ValueError(f"bodies: expected names besides {PROBE}, which carries target, found {PROBE}")
+        for (name, one), (rival, other) in combinations(self.targets.items(), 2):
+            parted = parted_mm(one, other)
+            if parted < LEAST_PARTED_MM and not (one.unusual or other.unusual):
+                own = f"bodies.{rival}"
+                raise ValueError(
+                    f"{own}: expected three circles whose distances differ by {LEAST_PARTED_MM:g} mm or more from those of the "
+                    f"{name}'s target, or circles {100 * PARTED_SIZES:.0f} % larger or smaller, found {parted:.1f} mm: either "
+                    f"may be taken for the other. `sonotwin print part=target family={len(self.targets)}` proposes targets that "
+                    f"can't; unusual=true takes them as they are"
+                )
+        return self
