@@ -1,4 +1,4 @@
-"""A sheet for a printer as vector PDF: a card to cut out, true to scale, with cut marks, a ruler along each axis and small print.
+"""Sheets for a printer as vector PDF: on each a card to cut out, true to scale, cut marks, a ruler along each axis, small print.
 
 Lengths are mm; the origin is the lower left corner, of the card or of the paper, y upwards.
 """
@@ -58,6 +58,14 @@ class Sheet(NamedTuple):
     card: Size  # lower left corner of the card
 
 
+class Page(NamedTuple):
+    """A card on its sheet, and the small print, of which the first line is bold."""
+
+    card: Card
+    sheet: Sheet
+    lines: Sequence[str]
+
+
 def needed(card: Size, margin_mm: float) -> Size:
     """Size of the paper that a card of a size needs, with rulers, marks and a margin on which no printer prints."""
     marks_mm = 5.0  # around the card, for the cut marks
@@ -81,27 +89,23 @@ def smallest_paper(card: Size, margin_mm: float) -> str | None:
     return next((name for name, paper in PAPERS.items() if lay_out(card, paper, margin_mm)), None)
 
 
-def write(path: Path, card: Card, sheet: Sheet, margin_mm: float, title: str, lines: Sequence[str]) -> None:
-    """Write the sheet as PDF of one page; the same input gives the same bytes.
-
-    Parameters
-    ----------
-    lines : the small print, of which the first is bold
-    """
-    point_mm = 25.4 / 72  # PDF's unit
-    canvas = Canvas(str(path), pagesize=(sheet.paper[0] / point_mm, sheet.paper[1] / point_mm), invariant=1)
+def write(path: Path, pages: Sequence[Page], margin_mm: float, title: str) -> None:
+    """Write sheets as PDF, a page each; the same input gives the same bytes."""
+    point_mm, hairline_mm = 25.4 / 72, 0.1  # PDF's unit
+    canvas = Canvas(str(path), invariant=1)
     canvas.setTitle(title)
     canvas.setCreator("sonotwin")
     canvas.setViewerPreference("PrintScaling", "None")  # so that viewers offer 100 % first
-    canvas.scale(1 / point_mm, 1 / point_mm)
-    hairline_mm = 0.1
-    canvas.setLineWidth(hairline_mm)
-    _draw_card(canvas, card, sheet.card)
-    _draw_marks(canvas, card.size, sheet.card)
-    _draw_rulers(canvas, (margin_mm + LEFT_MM, margin_mm + BELOW_MM))
     left = margin_mm + LEFT_MM + RULER_MM + 8
-    _write_lines(canvas, lines, (left, margin_mm + BELOW_MM - 3.5), sheet.paper[0] - margin_mm - left)
-    canvas.showPage()
+    for card, sheet, lines in pages:
+        canvas.setPageSize((sheet.paper[0] / point_mm, sheet.paper[1] / point_mm))
+        canvas.scale(1 / point_mm, 1 / point_mm)
+        canvas.setLineWidth(hairline_mm)
+        _draw_card(canvas, card, sheet.card)
+        _draw_marks(canvas, card.size, sheet.card)
+        _draw_rulers(canvas, (margin_mm + LEFT_MM, margin_mm + BELOW_MM))
+        _write_lines(canvas, lines, (left, margin_mm + BELOW_MM - 3.5), sheet.paper[0] - margin_mm - left)
+        canvas.showPage()
     canvas.save()
     content = path.read_bytes()
     path.write_bytes(content + _mark_of(content))

@@ -31,7 +31,7 @@ def propose(first: Target, count: int) -> list[Target]:
                 f"family: expected up to {len(family)} targets with circles of {first.outer_diameter_mm:g} mm, found {count}; "
                 "give rig.target smaller circles"
             )
-        wide_mm = 2 * LEAST_PARTED_MM  # beyond which a smaller board counts more
+        wide_mm = 3 * LEAST_PARTED_MM  # beyond which a smaller board counts more
         family.append(min((one for far, one in parted if far >= min(most, wide_mm)), key=lambda one: np.prod(one.board_mm)))
     return family
 

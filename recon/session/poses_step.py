@@ -68,10 +68,11 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
     watch.say(f"read        {len(film.times)} pairs of frames, {sizes}{rate}")
     with atomic.new_folder(out, BY) as folder:
         start = perf_counter()
-        at_rest = first_reference(settings, tracker, film) if isinstance(tracker, BodyTracker) else None
+        of_patient = _of_patient(settings)
+        at_rest = first_reference(settings, tracker, film) if of_patient and isinstance(tracker, BodyTracker) else None
         steps = track(film, tracker, folder if settings.overlays else None, watch)
         figures = report(steps, targets, watch)
-        reference = at_rest or _first_seen(steps)
+        reference = at_rest or (_first_seen(steps) if of_patient else None)
         poses = results.track_of(steps[PROBE])
         if reference is not None:
             poses = tracks.relative(poses, results.track_of(steps[PATIENT]), reference.pose)
@@ -171,6 +172,12 @@ def mean_image(capture: Path, camera: str, calibration: Path | None = None) -> N
     """Mean : (h, w) DN of 255 of a camera's images of the fringe sequence, in which fringes even out."""
     shots = surface_part.read_surface(capture, camera, calibration)
     return shots.images.mean(axis=0, dtype=np.float32) * np.float32(255 / (2**shots.bits - 1))
+
+
+def _of_patient(settings: Settings) -> bool:
+    """Whether a sweep is of the patient: one over wires or a flat bottom is of things that stand elsewhere, at rest."""
+    _, part = manifest.read_manifest(settings.capture).sweep_of(settings.capture / manifest.MANIFEST, "frames", settings.sweep)
+    return part.purpose in ("volume", None)
 
 
 def _first_seen(steps: Mapping[str, list[Step]]) -> Reference | None:

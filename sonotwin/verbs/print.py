@@ -1,8 +1,9 @@
-"""Draw a calibration board or the probe's target for a printer: a PDF of one page, true to scale.
+"""Draw a calibration board or a body's target for a printer: a PDF, true to scale.
 
 `part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the rings of
-`rig.target`. Around the card to cut out are cut marks, a ruler of 100 mm along each axis, and its lengths in small print.
-Writes the file `out`; one that is there is replaced. Takes a second.
+`rig.target`, or of another `body` of the rig. `family=3` draws three targets, a page each, of which none is taken for another,
+and prints the lines that describe all but the first as bodies of a rig. Around the card to cut out are cut marks, a ruler of
+100 mm along each axis, and its lengths in small print. Writes the file `out`; one that is there is replaced. Takes a second.
 
 Print at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper wherever board or
 target are described: docs/calibration.md says how.
@@ -11,6 +12,8 @@ target are described: docs/calibration.md says how.
     sonotwin print part=board board='{kind: charuco, columns: 8, rows: 11, square_mm: 20, marker_mm: 15}' paper=a4 out=charuco.pdf
     sonotwin print part=board board='{kind: aprilgrid, columns: 6, rows: 6, tag_mm: 24}' paper=a4 out=aprilgrid.pdf
     sonotwin print part=target out=target.pdf
+    sonotwin print part=target rig=three_bodies body=needle out=needle.pdf
+    sonotwin print part=target family=3 out=targets.pdf
 """
 
 from pathlib import Path
@@ -19,12 +22,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from recon.artwork import board_drawing, paper_sheet, target_drawing
-from recon.artwork.paper_sheet import PAPERS, Card, Sheet, Size
+from recon.artwork.paper_sheet import PAPERS, Card, Page, Sheet, Size
 from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
-from recon.errors import InputError
+from recon.errors import InputError, did_you_mean
 from recon.files import atomic
+from recon.model import target_family
 from recon.model.boards import Board, Discs
-from recon.model.rig import Rig, Target
+from recon.model.rig import PROBE, Rig, Target, parted_mm
 from recon.registry import Choice
 from sonotwin.verbs.describe import design
 
@@ -46,6 +50,10 @@ class Config(BaseModel):
     """board, for cameras and projector; or target, for the probe"""
     out: Path
     """the PDF to write"""
+    body: str = PROBE
+    """with part=target: probe, or a name in rig.bodies"""
+    family: Annotated[int, Field(ge=2, le=target_family.MOST)] | None = None
+    """with part=target: draw so many targets that can be told apart, that of `body` the first"""
     board: dict[str, Any] | None = None
     """kind, columns, rows and lengths in mm, as of `describe`; null: 11 rows of 4 discs of 9 mm, 15 mm apart"""
     paper: Paper | tuple[Millimetres, Millimetres] = "a4"
@@ -57,6 +65,11 @@ class Config(BaseModel):
     def _board_to_draw(self) -> "Config":
         if self.part == "target" and self.board is not None:
             raise ValueError("board: expected none with part=target, which draws rig.target")
+        for name, value in (("body", self.body if self.body != PROBE else None), ("family", self.family)):
+            if self.part == "board" and value is not None:
+                raise ValueError(f"{name}: expected none with part=board, found {value}")
+        if self.body not in self.rig.targets:
+            raise ValueError(f"body: expected one of {', '.join(self.rig.targets)}, found {self.body}{near(self.body, self.rig)}")
         return self
 
 
@@ -76,7 +89,7 @@ def run(config: Config) -> None:
         expected, found = "expected nothing or a sheet as it was written", "found a file of others, or a changed one"
         raise InputError(f"{config.out}: {expected}, {found}; choose another out")
     if config.part == "target":
-        draw_target(config, config.rig.target)
+        draw_targets(config, config.rig.targets[config.body])
     else:
         draw_board(config, USUAL if config.board is None else design(config.board))
 
@@ -87,19 +100,37 @@ def draw_board(config: Config, board: Board) -> None:
     card, words = board_drawing.card_of(board), board_drawing.in_words(board)
     sheet = placed(config, card, shorter_board(config, board))
     scale = "Rulers not 100.0 mm long? Multiply the board's lengths by their mean / 100, wherever you give board={...}."
-    write(config, card, sheet, words, [scale, "Matt paper, glued flat onto glass or aluminium."])
+    write(config, [page(card, sheet, words, [scale, "Matt paper, glued flat onto glass or aluminium."])], words)
     field = f"board='{board_drawing.as_field(board)}'"
     report(config, card, sheet, f"sonotwin describe folder=poses {field} out=capture  # with the lengths as printed")
 
 
-def draw_target(config: Config, target: Target) -> None:
-    """Draw the probe's target."""
-    card, words = target_drawing.card_of(target), target_drawing.in_words(target)
-    sheet = placed(config, card, "")
-    scale = "Rulers not 100.0 mm long? Multiply rig.target.c1_mm by the lower / 100 and c2_mm by the left / 100, or film it"
+def draw_targets(config: Config, first: Target) -> None:
+    """Draw a body's target, or a family of which it is the first."""
+    targets = [first] if config.family is None else target_family.propose(first, config.family)
+    scale = "Rulers not 100.0 mm long? Multiply c1_mm by the lower / 100 and c2_mm by the left / 100, or film it"
     care = "This side up: c0 is below at the left. Matt paper, glued flat onto a stiff board."
-    write(config, card, sheet, words, [f"{scale}: sonotwin calibrate-target.", care])
-    report(config, card, sheet, "sonotwin calibrate-target capture=film out=target  # of a film of it as it was printed")
+    pages = []
+    for target in targets:
+        card = target_drawing.card_of(target)
+        notes = [f"{scale}: sonotwin calibrate-target.", care]
+        pages.append(page(card, placed(config, card, ""), target_drawing.in_words(target), notes))
+    title = target_drawing.in_words(first) if len(targets) == 1 else f"{len(targets)} targets"
+    write(config, pages, title)
+    report(
+        config, pages[0].card, pages[0].sheet, "sonotwin calibrate-target capture=film out=target  # of a film of it as printed"
+    )
+    for number, target in enumerate(targets[1:], start=2):
+        parted = min(parted_mm(target, other) for other in targets if other is not target)
+        given = (*target.LENGTHS, "outer_diameter_mm", "inner_diameter_mm", "board_mm")
+        described = target.model_dump(mode="json")
+        fields = ", ".join(f"{name}: {described[name]}" for name in given)
+        print(f"page {number}      parted by {parted:.1f} mm from the others; in a rig's file: bodies: {{NAME: {{{fields}}}}}")
+
+
+def near(name: str, rig: Rig) -> str:
+    """The body that a name may mean."""
+    return did_you_mean(name, list(rig.targets))
 
 
 def check_discs(board: Board) -> None:
@@ -138,12 +169,16 @@ def shorter_board(config: Config, board: Board) -> str:
     return f"at most {board_drawing.lengths_in_words(board_drawing.scaled(board, least))}"
 
 
-def write(config: Config, card: Card, sheet: Sheet, words: str, notes: list[str]) -> None:
+def page(card: Card, sheet: Sheet, words: str, notes: list[str]) -> Page:
+    """A card on its sheet with the small print."""
+    return Page(card, sheet, ["Print at 100 %, not fitted to the page, and measure both rulers.", f"sonotwin {words}.", *notes])
+
+
+def write(config: Config, pages: list[Page], words: str) -> None:
     """Write the PDF."""
-    lines = ["Print at 100 %, not fitted to the page, and measure both rulers.", f"sonotwin {words}.", *notes]
     config.out.parent.mkdir(parents=True, exist_ok=True)
     with atomic.new_file(config.out) as path:
-        paper_sheet.write(path, card, sheet, config.margin_mm, f"sonotwin {words}", lines)
+        paper_sheet.write(path, pages, config.margin_mm, f"sonotwin {words}")
 
 
 def report(config: Config, card: Card, sheet: Sheet, following: str) -> None:

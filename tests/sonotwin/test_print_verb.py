@@ -3,7 +3,10 @@
 import re
 
 import pytest
+import yaml
 
+from recon.model.rig import Rig
+from sonotwin import choices
 from sonotwin.cli import main
 from tests.recon.artwork.rasters import raster
 
@@ -102,3 +105,28 @@ def test_a_pdf_of_others_is_left_alone(tmp_path, capsys):
     assert (tmp_path / "thesis.pdf").read_bytes() == b"%PDF-1.4 years of work"
     for _ in range(2):
         assert main(["print", "part=board", f"out={tmp_path / 'board.pdf'}"]) == 0
+
+
+def test_a_family_of_targets_is_drawn_that_makes_a_rig(tmp_path, capsys):
+    """Three pages; the lines printed describe bodies that the rig's check takes; another body's target is drawn by its name."""
+    out = tmp_path / "targets.pdf"
+    assert main(["print", "part=target", "family=3", f"out={out}"]) == 0
+    printed = capsys.readouterr().out
+    assert out.read_bytes().count(b"/Type /Page\n") == 3 or b"/Count 3" in out.read_bytes()
+    maps = re.findall(r"bodies: (\{NAME: \{.*\}\})", printed)
+    bodies = {f"body{k}": yaml.safe_load(one)["NAME"] for k, one in enumerate(maps)}
+    rig = choices.read_rig()
+    assert len(Rig.model_validate(rig.model_dump() | {"bodies": bodies}).targets) == 3
+    assert main(["print", "part=target", "rig=three_bodies", "body=needle", f"out={tmp_path / 'needle.pdf'}"]) == 0
+    assert "59 x 53 mm" in capsys.readouterr().out
+
+
+def test_bodies_that_are_not_there_and_families_of_boards_are_refused(tmp_path, capsys):
+    for fields, said in (
+        (["part=target", "rig=three_bodies", "body=nedle"], "body: expected one of probe, needle, patient, found nedle"),
+        (["part=target", "family=9"], "family: expected less than or equal to 6"),
+        (["part=board", "family=2"], "family: expected none with part=board"),
+    ):
+        assert main(["print", *fields, f"out={tmp_path / 'x.pdf'}"]) == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / "x.pdf").exists()

@@ -30,7 +30,8 @@ def sheet_of(board, path):
     """Write the board's sheet on A4; returns the place of its first point on the raster : (2,) mm from the upper left."""
     card = board_drawing.card_of(board)
     sheet = paper_sheet.lay_out(card.size, A4, MARGIN)
-    paper_sheet.write(path, card, sheet, MARGIN, "board", ["in bold", board_drawing.in_words(board)])
+    lines = ["in bold", board_drawing.in_words(board)]
+    paper_sheet.write(path, [paper_sheet.Page(card, sheet, lines)], MARGIN, "board")
     return sheet
 
 

@@ -16,7 +16,7 @@ LINES = ["Print at 100 %", "a line of small print that is long enough to be brok
 
 def drawn(path, card=CARD, paper="a4"):
     sheet = paper_sheet.lay_out(card.size, PAPERS[paper], MARGIN)
-    paper_sheet.write(path, card, sheet, MARGIN, "a board", LINES)
+    paper_sheet.write(path, [paper_sheet.Page(card, sheet, LINES)], MARGIN, "a board")
     return sheet
 
 

@@ -16,7 +16,8 @@ def sheet(rig, tmp_path_factory):
     tmp_path = tmp_path_factory.mktemp("sheet")
     card = target_drawing.card_of(rig.target)
     laid = paper_sheet.lay_out(card.size, paper_sheet.PAPERS["a4"], 5.0)
-    paper_sheet.write(tmp_path / "target.pdf", card, laid, 5.0, "target", ["in bold", target_drawing.in_words(rig.target)])
+    lines = ["in bold", target_drawing.in_words(rig.target)]
+    paper_sheet.write(tmp_path / "target.pdf", [paper_sheet.Page(card, laid, lines)], 5.0, "target")
     image, pixel = raster(tmp_path / "target.pdf", 300)
     return image, pixel, photographs.find(image, networks.load(), rig.target)
 

@@ -1,5 +1,6 @@
 """Frames of the target, drawn: rings by supersampling on the pixel grid, blurred by lens and motion, read by the rig's sensor."""
 
+import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -18,6 +19,7 @@ LENS_PX = 0.55  # standard deviation in focus, of the lens with a little defocus
 SUBSAMPLES = 5  # a side
 BLURRED_PX = 6  # about the board: ten times the lens's blur
 STRIP = 64  # rows
+ROOM_MM = 86.0  # between the middles of two boards, of a half diagonal of 43 mm
 MARGIN_MM = 14.0  # of white about the discs' middles
 BOARD = np.array([[-MARGIN_MM, -MARGIN_MM], [25 + MARGIN_MM, 40 + MARGIN_MM]])  # mm, corners in the target's frame
 
@@ -98,6 +100,36 @@ def frame(camera, poses, target, white=100.0, rng=None, lens=LENS_PX, ground=0.2
     if light is not None:
         image = image * light
     return image if even else image + BLACK_DN if rng is None else read_out(image, rng)
+
+
+def together(camera, bodies, white=65.0, rng=None):
+    """A frame of several bodies : pairs of poses over the exposure, a list, and a target; later ones lie before earlier ones."""
+    image = None
+    for poses, target in bodies:
+        one = frame(camera, poses, target, white, rng)
+        if image is not None:
+            corners = np.array([[x, y, 0.0] for x, y in zip(BOARD[[0, 1, 1, 0], 0], BOARD[[0, 0, 1, 1], 1], strict=True)])
+            there = np.zeros(one.shape, np.uint8)
+            for place in poses:
+                outline = np.rint(camera.project(rigid.apply(place, corners))).astype(np.int32)
+                cv2.fillConvexPoly(there, outline, 1)
+            one = np.where(cv2.dilate(there, np.ones((5, 5))) > 0, one, image)
+        image = one
+    return image
+
+
+def apart(rng, targets, tilt_deg=30.0):
+    """Poses of bodies that face the cameras, with room between their boards, in both views."""
+    while True:
+        middles = rng.uniform([-90, -65, 620], [80, 65, 700], (len(targets), 3))
+        away = np.linalg.norm(middles[:, None, :2] - middles[None, :, :2], axis=-1) + 1e9 * np.eye(len(targets))
+        if away.min() > ROOM_MM:
+            break
+    turns = Rotation.from_euler(
+        "zyx", rng.uniform([-180, -tilt_deg, -tilt_deg], [180, tilt_deg, tilt_deg], (len(targets), 3)), True
+    )
+    turns = np.diag([1.0, -1.0, -1.0]) @ turns.as_matrix()
+    return [rigid.transform(turn, middle - turn @ [12.5, 20.0, 0.0]) for turn, middle in zip(turns, middles, strict=True)]
 
 
 def read_out(mean, rng):

@@ -1,0 +1,161 @@
+"""Several bodies in one pair of frames: each found as itself, or not at all, and why."""
+
+import numpy as np
+import pytest
+
+from recon.geometry import rigid
+from recon.model import circle_layout
+from recon.model.rig import Rig
+from recon.tracking import constellations, networks
+from recon.tracking.bodies import BodyTracker
+from recon.tracking.tracker import Tracker, is_beside
+from sonotwin import choices
+from tests.recon.tracking import drawings
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return choices.read_rig("three_bodies")
+
+
+@pytest.fixture(scope="module")
+def cameras(rig):
+    return rig.cam1.optics.camera(), rig.cam2.optics.camera()
+
+
+@pytest.fixture(scope="module")
+def found_by():
+    return networks.load(by_geometry=True)
+
+
+@pytest.fixture
+def tracker(rig, cameras, found_by):
+    return of(rig, cameras, found_by)
+
+
+def of(rig, cameras, found_by, **settings) -> BodyTracker:
+    return BodyTracker({name: Tracker(cameras, target, found_by) for name, target in rig.targets.items()}, **settings)
+
+
+def pair(cameras, bodies, rng, white=65.0):
+    """Frames of bodies : pairs of a pose and a target."""
+    return [drawings.together(camera, [([place], target) for place, target in bodies], white, rng) for camera in cameras]
+
+
+def off_mm(found, place):
+    return np.linalg.norm(found.pose.world_from_target[:3, 3] - place[:3, 3])
+
+
+@pytest.fixture(scope="module")
+def places(rig):
+    return dict(zip(rig.targets, drawings.apart(np.random.default_rng(3), list(rig.targets.values())), strict=True))
+
+
+@pytest.fixture(scope="module")
+def frames(rig, cameras, places):
+    return pair(cameras, [(places[name], target) for name, target in rig.targets.items()], np.random.default_rng(3))
+
+
+class Counted:
+    """Networks that count how often they look at whole frames."""
+
+    def __init__(self, networks):
+        self.networks, self.detections = networks, 0
+
+    def detect(self, images):
+        self.detections += 1
+        return self.networks.detect(images)
+
+    def segment(self, patches):
+        return self.networks.segment(patches)
+
+
+def test_all_are_found_in_one_pass_and_then_followed(rig, cameras, found_by, places, frames):
+    """Each as itself, to the noise of its rims; the detector looks at each camera's frame once, then at none."""
+    counted = Counted(found_by)
+    tracker = of(rig, cameras, counted)
+    for time_s, how in ((0.0, "detected"), (1 / 60, "predicted"), (2 / 60, "predicted")):
+        for name, found in tracker.step(*frames, time_s).items():
+            assert found.how == how, f"{name}: {found.pose.reason}"
+            assert off_mm(found, places[name]) < 0.05
+            assert found.pose.total.shape == (6, 6) and np.linalg.eigvalsh(found.pose.total).min() > 0
+    assert counted.detections == 2
+
+
+def test_each_is_as_exact_as_if_it_were_alone(rig, cameras, found_by, places, frames):
+    """The same rims give the same pose, whoever else is in view."""
+    together = of(rig, cameras, found_by).step(*frames)
+    for name, target in rig.targets.items():
+        alone = Tracker(cameras, target, found_by).step(*pair(cameras, [(places[name], target)], np.random.default_rng(3)))
+        assert alone.found
+        off = rigid.difference(alone.pose.world_from_target, together[name].pose.world_from_target)
+        assert off @ np.linalg.solve(alone.pose.covariance + together[name].pose.covariance, off) < 30  # chi-square, 6 degrees
+
+
+@pytest.mark.parametrize("missing", ["probe", "needle", "patient"])
+def test_one_that_is_away_is_lost_and_no_other_is_taken_for_it(rig, cameras, tracker, places, missing):
+    bodies = [(places[name], target) for name, target in rig.targets.items() if name != missing]
+    found = tracker.step(*pair(cameras, bodies, np.random.default_rng(4)))
+    assert [name for name, one in found.items() if not one.found] == [missing]
+    assert found[missing].pose.reason
+
+
+def test_a_second_one_of_a_design_is_told_with_its_place(rig, cameras, tracker, places):
+    """The needle is away; a second probe lies in its place."""
+    bodies = [(places["probe"], rig.target), (places["needle"], rig.target), (places["patient"], rig.bodies["patient"])]
+    found = tracker.step(*pair(cameras, bodies, np.random.default_rng(5)))
+    assert found["probe"].found and found["patient"].found and not found["needle"].found
+    assert is_beside(found["probe"].apart_mm) and found["patient"].apart_mm == np.inf
+    expected = np.linalg.norm(places["probe"][:3, 3] - places["needle"][:3, 3])
+    assert found["probe"].apart_mm == pytest.approx(expected, abs=0.2)
+
+
+def test_two_bodies_of_one_design_are_told_neither(rig, cameras, found_by, places):
+    """Where the rig's file insists on them: which is which nothing tells, until one was known."""
+    twin = rig.target.model_dump() | {"unusual": True}
+    twins = Rig.model_validate(rig.model_dump() | {"bodies": {"needle": twin}})
+    tracker = of(twins, cameras, found_by)
+    shown = pair(cameras, [(places["probe"], rig.target)], np.random.default_rng(6))
+    found = tracker.step(*shown, 0.0)
+    assert {one.pose.reason for one in found.values()} == {"circles of the probe, or of the needle: no distance tells which"}
+    tracker.trackers["probe"].remember(places["probe"], 0.01)
+    found = tracker.step(*shown, 0.02)
+    assert found["probe"].found and not found["needle"].found
+
+
+def test_a_search_for_what_is_lost_waits_while_another_is_followed(rig, cameras, found_by, places):
+    bodies = [(places["probe"], rig.target), (places["patient"], rig.bodies["patient"])]
+    shown = pair(cameras, bodies, np.random.default_rng(7))
+    counted = Counted(found_by)
+    tracker = of(rig, cameras, counted, search_s=0.2)
+    looks = []
+    for k in range(20):
+        tracker.step(*shown, 0.5 + k / 60)
+        looks.append(counted.detections)
+    searches = np.flatnonzero(np.diff(looks, prepend=0))
+    assert searches[0] == 0 and (np.diff(searches) >= 12).all() and len(searches) == 2  # each 0.2 s at 60 pairs a second
+
+
+def test_rings_that_no_body_has_are_no_body(rig, cameras, found_by, places):
+    """Points as far apart as another target's circles."""
+    other = circle_layout.with_lengths(rig.target, np.array([46.0, 20.0, 36.0]))
+    found = of(rig, cameras, found_by).step(*pair(cameras, [(places["probe"], other)], np.random.default_rng(8)))
+    assert not any(one.found for one in found.values())
+
+
+def test_points_are_chosen_by_distances_alone(rig, rng):
+    """Among 12 points at random the circles of a moved target are found in their order, the surest first."""
+    model = circle_layout.circle_centres(rig.target)
+    place = drawings.facing(rng)
+    others = rng.uniform([-100, -80, 600], [100, 80, 700], (9, 3))
+    places = np.concatenate([others[:4], rigid.apply(place, model), others[4:]])
+    numbers = np.arange(len(places))
+    points = constellations.Points(np.column_stack([numbers, numbers]), places, np.full(len(places), 9.0))
+    assert constellations.choices(points, rig.target)[0].tolist() == [4, 5, 6]
+    wider = points.__class__(points.rings, places, np.full(len(places), 14.0))
+    assert not constellations.choices(wider, rig.target)
+
+
+def test_frames_of_another_size_are_refused_for_all(tracker):
+    found = tracker.step(np.zeros((10, 10), np.uint8), np.zeros((10, 10), np.uint8))
+    assert all("expected an image of 1280x1024" in one.pose.reason for one in found.values())
