@@ -31,7 +31,15 @@ from recon.session import (
     store,
     volume_step,
 )
-from recon.session.settings import BarFields, BoardLengthField, EchoFields, ScaleFields, Spacing, TargetField
+from recon.session.settings import (
+    BarFields,
+    BoardLengthField,
+    BodyTargetFields,
+    EchoFields,
+    ScaleFields,
+    Spacing,
+    TargetField,
+)
 from recon.session.store import Store, files_of
 from recon.session.tracker_settings import TrackingFields
 from recon.session.watch import SILENT, Watch
@@ -45,7 +53,7 @@ WITHIN = 0.2  # of usual drift, that devices drift within a session: fringes and
 Command = Callable[[optics_step.Settings, Path], str]
 
 
-class Settings(EchoFields, TissueFields, TargetField, BoardLengthField, BarFields, TrackingFields, ScaleFields):
+class Settings(EchoFields, TissueFields, TargetField, BodyTargetFields, BoardLengthField, BarFields, TrackingFields, ScaleFields):
     """Source, and what is known beforehand."""
 
     rig: Annotated[Rig, Choice("meza2021")]
@@ -129,7 +137,8 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
     """
     sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command)
     steps = Store(out, watch.announce, code)
-    given = (settings.calibration, settings.target, settings.probe, settings.networks, *settings.bars)
+    files = settings.calibration, settings.target, settings.probe, settings.networks
+    given = (*files, *settings.bars, *settings.measured.values())
     check(sources)
     with steps.opened([settings.capture, *given]):
         calibrated = calibrate_optics(steps, sources)
@@ -296,13 +305,16 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, 
         return steps.leave_out(step, f"neither frames of {' and '.join(CAMERAS)} nor a track")
     if optics is None:
         return steps.leave_out(step, _no(steps, "optics", NO_OPTICS))
-    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "networks", "overlays")
+    same = ("rig", "capture", "naming", "drift_px", "board_scale", "target", "measured", "networks", "overlays")
     fields = {field: getattr(settings, field) for field in same} | {"sweep": name, "calibration": optics}
     fields["board_scale"] = scale_left(steps, settings)
     if corrected and calibration_files.read(optics).uncertainty is not None:
         fields |= {"drift_px": WITHIN * settings.drift_px, "board_scale": None}
     weights = settings.networks or networks.WEIGHTS
-    made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *filter(None, [settings.target]))
+    measured = [*filter(None, [settings.target]), *settings.measured.values()]
+    made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *measured)
+    if settings.rig.bodies and sources.held.surface is not None:
+        made_of |= {"reference": sources.files("surface")}
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
     return steps.do(step, does, poses_step.BY, poses_step.Settings, fields, work, made_of)
 

@@ -18,7 +18,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import PATIENT, PROBE, Target
 from recon.model.tracks import Track
-from recon.session.tracker_settings import MeasuredTargetFields, make_body_tracker, make_tracker, target_of
+from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
 from recon.session.watch import SILENT, Watch
 from recon.tracking import results, track_figures
 from recon.tracking.bodies import BodyTracker
@@ -29,7 +29,7 @@ BY = "track"  # who writes
 REFERENCE = f"{BODIES}/{PATIENT}/reference.csv"
 
 
-class Settings(MeasuredTargetFields):
+class Settings(BodyFields):
     """Source, and settings of the tracker."""
 
     capture: Path
@@ -58,10 +58,11 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
     InputError
         If the capture is incomplete or damaged, a network is missing, or `out` can't be written to.
     """
-    sources = (settings.capture, settings.calibration, settings.target, settings.networks, settings.reference)
+    given = (settings.calibration, settings.target, *settings.measured.values(), settings.networks, settings.reference)
+    sources = (settings.capture, *given)
     atomic.check_folder(out, BY, inputs=sources)
     film = stereo_frames.read_film(settings.capture, settings.calibration, settings.sweep)
-    targets = settings.rig.targets | {PROBE: target_of(settings)}
+    targets = targets_of(settings)
     tracker = _tracker(settings, film)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
@@ -99,7 +100,7 @@ def _tracker(settings: Settings, film: Film) -> Tracker | BodyTracker:
     """A tracker of the probe alone, or of all bodies of the rig."""
     if settings.rig.bodies:
         return make_body_tracker(settings, film.cameras, film.optics, film.bits)
-    return make_tracker(settings, target_of(settings), film.cameras, film.optics, film.bits)
+    return make_tracker(settings, targets_of(settings)[PROBE], film.cameras, film.optics, film.bits)
 
 
 def report(steps: Mapping[str, list[Step]], targets: Mapping[str, Target], watch: Watch) -> Metrics:

@@ -75,6 +75,13 @@ class TargetField(Part):
     """file of `sonotwin calibrate-target`: the target as it was measured, instead of the design's"""
 
 
+class BodyTargetFields(Part):
+    """The field of a step that tracks further bodies, of which the targets may have been measured."""
+
+    measured: dict[str, Path] = Field(default_factory=dict)
+    """files of `sonotwin calibrate-target` by names of rig.bodies, instead of their designs: measured.needle=FILE"""
+
+
 def _rising(value: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
     depths = [depth for depth, _ in value or ()]
     if any(second <= first for first, second in pairwise(depths)):

@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from recon.capture import target_files
+from recon.errors import InputError, did_you_mean
 from recon.geometry.camera import Camera
 from recon.model.calibration import DRIFT_PX, Uncertainty
 from recon.model.part import Part
 from recon.model.rig import PROBE, Rig, Target
 from recon.registry import Choice
-from recon.session.settings import BoardField, TargetField
+from recon.session.settings import BoardField, BodyTargetFields, TargetField
 from recon.tracking import networks
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.networks import OnnxNetworks
@@ -56,20 +57,41 @@ class MeasuredTargetFields(TargetField, TrackerFields):
     """Fields of a step that tracks the target as it was measured, by a tracker of its own."""
 
 
+class BodyFields(BodyTargetFields, MeasuredTargetFields):
+    """Fields of a step that tracks all bodies of the rig."""
+
+
 def target_of(fields: MeasuredTargetFields) -> Target:
     """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
     design = fields.rig.target
     return design if fields.target is None else target_files.read(fields.target, design)
 
 
+def targets_of(fields: BodyFields) -> dict[str, Target]:
+    """Targets of all bodies by name, as they were measured, else their designs.
+
+    Raises
+    ------
+    InputError
+        As of `recon.capture.target_files.read`, or if a measured one is of no body of the rig.
+    """
+    bodies = fields.rig.bodies
+    for name, path in fields.measured.items():
+        if name not in bodies:
+            expected = f"one of rig.bodies, {', '.join(bodies)}" if bodies else "none, as rig.bodies names none"
+            raise InputError(f"measured.{name}: expected {expected}, found {path}{did_you_mean(name, list(bodies))}")
+    read = {name: target_files.read(path, bodies[name]) for name, path in fields.measured.items()}
+    return {PROBE: target_of(fields), **bodies, **read}
+
+
 def make_body_tracker(
-    fields: MeasuredTargetFields, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
+    fields: BodyFields, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None, search_s: float = 0.0
 ) -> BodyTracker:
-    """The tracker of all bodies of a rig, of which the probe's target may have been measured; raises as `make_tracker`."""
+    """The tracker of all bodies of a rig; see `make_tracker`, and `BodyTracker` for `search_s`."""
     loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads, fields.rig.target.kind, by_geometry=True)
-    targets = fields.rig.targets | {PROBE: target_of(fields)}
     settings = bits, known, fields.drift_px, fields.board_scale
-    return BodyTracker({name: Tracker(cameras, target, loaded, *settings) for name, target in targets.items()})
+    trackers = {name: Tracker(cameras, target, loaded, *settings) for name, target in targets_of(fields).items()}
+    return BodyTracker(trackers, search_s)
 
 
 def make_tracker(

@@ -1,9 +1,11 @@
-"""Track the probe's target through the frames of two cameras.
+"""Track the targets of probe and other bodies through the frames of two cameras.
 
 Reads a capture folder with frames of both cameras (sweep/cam1, sweep/cam2) and their calibration; frames are paired by their time
-stamps. Writes into the folder `out`: poses.csv, poses with their covariance in the layout that all verbs read; frames.csv, the
-way in which each pose was found, or the reason why not; overlays/, both views side by side with the rims found; and metrics.json.
-Exit status 1 if no pair shows the target.
+stamps. Writes into the folder `out`: poses.csv, the probe's poses with their covariance in the layout that all verbs read;
+frames.csv, the way in which each pose was found, or the reason why not; overlays/, both views side by side with the rims found;
+metrics.json; and of further bodies in rig.bodies the same tables, in bodies/NAME. A second body of a design in view is a warning.
+With a body `patient` the probe's poses are told as if the patient stood where it stood when the skin was measured.
+Exit status 1 if no pair shows a body.
 Frames are read one after the other, so a film may be of any length. Results that are there already are replaced. Takes some
 seconds, the first time a minute to compile, and 20 to 60 frames a second from then on.
 
@@ -14,6 +16,7 @@ poses are given it instead:
     sonotwin track capture=outputs/film/capture out=outputs/track
     sonotwin track capture=recorded calibration=calibration/optics.yaml out=tracked
     sonotwin track capture=recorded target=target/target.yaml out=tracked
+    sonotwin track capture=recorded rig=three_bodies measured.needle=needle/target.yaml out=tracked
     sonotwin freehand capture=tracked probe=probe.yaml lag_s=0.05 out=volume
 """
 
@@ -27,7 +30,7 @@ class Config(poses_step.Settings):
     """Fields of `sonotwin track`."""
 
     out: Path
-    """folder: gets poses.csv, frames.csv, overlays/, metrics.json; and manifest.json if there are B-scans"""
+    """folder: gets poses.csv, frames.csv, overlays/, metrics.json; bodies/ of further ones; manifest.json, if there are B-scans"""
 
 
 def run(config: Config) -> int:

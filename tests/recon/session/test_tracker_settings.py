@@ -9,7 +9,8 @@ import pytest
 from recon.capture import target_files
 from recon.capture.manifest import CAMERAS
 from recon.errors import InputError
-from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import BodyFields, MeasuredTargetFields, make_tracker, target_of, targets_of
+from sonotwin import choices
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +48,16 @@ def test_steps_without_a_tracker_wait_for_none():
     program = "import sys, recon.session.masses_step, recon.session.probe_step; print('onnxruntime' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_bodies_have_their_measured_targets(tmp_path):
+    """By name; a file for a body that the rig doesn't have is refused with the name that may be meant."""
+    rig = choices.read_rig("three_bodies")
+    design = rig.bodies["needle"]
+    target_files.write(tmp_path / "needle.yaml", design.model_copy(update={"c1_mm": 24.05}), 1e-4 * np.eye(7))
+    fields = BodyFields(rig=rig, measured={"needle": tmp_path / "needle.yaml"})
+    found = targets_of(fields)
+    assert list(found) == ["probe", "needle", "patient"] and found["patient"] == rig.bodies["patient"]
+    assert found["needle"].c1_mm == pytest.approx(24.05) and found["needle"].covariance_mm2 is not None
+    with pytest.raises(InputError, match=r"measured\.nedle: expected one of rig\.bodies, needle, patient.*did you mean needle"):
+        targets_of(fields.model_copy(update={"measured": {"nedle": tmp_path / "needle.yaml"}}))
