@@ -33,7 +33,7 @@ from twin.ultrasound.transducer import Transducer
 
 Group = Literal[
     "optics", "surface", "reality", "calibration", "scale", "lifelike", "ultrasound", "tracking", "session", "studies",
-    "strangers", "trust", "live", "drift",
+    "strangers", "trust", "live", "drift", "bodies",
 ]  # fmt: skip
 
 
