@@ -87,7 +87,7 @@ def test_a_broken_file_of_rows_is_refused_first(quick, tmp_path, capsys):
         (
             "only=acoustics",
             "accuracy: only: expected 'optics', 'surface', 'reality', 'calibration', 'scale', 'lifelike', 'ultrasound', "
-            "'tracking', 'session', 'studies', 'strangers', 'trust', 'live' or 'drift', found 'acoustics'",
+            "'tracking', 'session', 'studies', 'strangers', 'trust', 'live', 'drift' or 'bodies', found 'acoustics'",
         ),
     ],
 )
