@@ -258,6 +258,10 @@ class Rig(Part):
     probe: Probe
     bodies: dict[BodyName, Target] = Field(default_factory=dict)  # such as a needle, or the patient
 
+    def __hash__(self) -> int:
+        """Of all parts, as frozen models have it; a mapping has none of its own."""
+        return hash((*(getattr(self, name) for name in type(self).model_fields if name != "bodies"), *self.bodies.items()))
+
     @property
     def targets(self) -> dict[str, Target]:
         """Targets of all bodies by name, the probe's first."""

@@ -64,3 +64,9 @@ def test_a_proposed_family_can_be_told_apart(rig):
     for one, other in combinations(family, 2):
         assert parted_mm(one, other) >= LEAST_PARTED_MM
     Rig.model_validate(rig.model_dump() | {"bodies": {f"body{k}": one.model_dump() for k, one in enumerate(family[1:])}})
+
+
+def test_rigs_with_bodies_are_kept_by_what_they_are(rig):
+    """Caches keep rigs by their hash: equal ones have one, others mostly another."""
+    same, without = Rig.model_validate(rig.model_dump()), rig.model_copy(update={"bodies": {}})
+    assert hash(rig) == hash(same) and len({rig, same, without}) == 2
