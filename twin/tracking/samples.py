@@ -1,6 +1,7 @@
 """One tracking sample's parameters: cameras, pose and motion, lights, materials, exposure; from (seed, k) alone."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model import circle_layout
-from recon.model.rig import CameraDevice, Lens, Rig, Sensor
+from recon.model.rig import PROBE, CameraDevice, Lens, Rig, Sensor
 from scenes.handheld.mesh_parts import SLOTS
 from twin.tracking.sampling_ranges import CameraRanges, DataRanges, LightRanges, PoseRanges, TargetRanges
 
@@ -83,8 +84,18 @@ class Print:
 
 
 @dataclass(frozen=True)
+class Held:
+    """A body that carries a target: how it moves, which variant it is, and its print."""
+
+    motion: Motion
+    body: int  # number of the variant in the bank
+    face: Print
+    present: bool = True
+
+
+@dataclass(frozen=True)
 class Take:
-    """All that makes one sample."""
+    """All that makes one sample: the probe, further bodies if there are any, what surrounds them, light and exposure."""
 
     k: int
     cameras: tuple[CameraDevice, CameraDevice]
@@ -101,6 +112,12 @@ class Take:
     gain: float
     noise_seed: int
     late: tuple[float, float] = (0.0, 0.0)  # of each camera's exposure, in exposures
+    others: Mapping[str, Held] = field(default_factory=dict)  # bodies besides the probe, by their names in `Rig.bodies`
+
+    @property
+    def held(self) -> dict[str, Held]:
+        """All bodies by name, the probe first."""
+        return {PROBE: Held(self.motion, self.body, self.face, self.present), **self.others}
 
 
 def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
