@@ -22,6 +22,7 @@ LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its 
 LEAST_PARTED_MM = 2.0  # by which distances of three circles of two bodies must differ, that one isn't taken for the other
 PARTED_SIZES = 0.2  # of a diameter, by which circles of two bodies differ that are never taken for each other
 PROBE = "probe"  # name of the body that carries `Rig.target`
+PATIENT = "patient"  # name of the body in whose frame all is told, where a rig has it
 FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from recon import arguments
 from recon.errors import InputError
+from recon.geometry import rigid
 
 Array = NDArray[np.float64]
 LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that images' time stamps are late; of a setting
@@ -70,6 +71,56 @@ def at(track: Track, times: NDArray[np.int64], max_gap_s: float = MAX_GAP_S) -> 
     result[inside, :3, :3] = Slerp(seconds, Rotation.from_matrix(poses[:, :3, :3]))(wanted[inside]).as_matrix()
     result[inside, :3, 3] = np.column_stack([np.interp(wanted[inside], seconds, poses[:, axis, 3]) for axis in range(3)])
     return result
+
+
+def relative(track: Track, reference: Track, at_first: Track) -> Track:
+    """A track in the world as it was when a reference body stood at its first pose: how that moved since is undone.
+
+    `world_from_body` becomes `world_from_first_reference @ reference_from_world @ world_from_body`. What errs alike in all poses
+    of the reference errs so in its first one, too, and mostly cancels; the first one's own noise is alike in all that follows.
+
+    Parameters
+    ----------
+    track, reference : of the same n moments; where the reference wasn't found there is no pose
+    at_first : the reference's first pose, the first one of this track that was found
+
+    Raises
+    ------
+    InputError
+        If the reference has no first pose, or the moments differ.
+    """
+    if not np.array_equal(track.times, reference.times):
+        raise InputError(f"reference: expected poses at the track's {len(track.times)} moments, found those of others")
+    if not at_first.found.any():
+        raise InputError("at_first: expected a pose of the reference, found none")
+    first = int(np.argmax(at_first.found))
+    start = at_first.poses[first]
+    back = np.array([start @ _inverse(pose) for pose in reference.poses])
+    poses = back @ track.poses
+    turned = back[:, :3, :3]
+    by_body, by_reference, by_first = (np.zeros((len(poses), 6, 6)) for _ in range(3))
+    by_body[:, :3, :3] = by_body[:, 3:, 3:] = turned
+    by_reference[:, :3, :3] = by_reference[:, 3:, 3:] = -turned
+    by_reference[:, 3:, :3] = turned @ rigid.cross(track.poses[:, :3, 3] - reference.poses[:, :3, 3])
+    by_first[:, :3, :3] = by_first[:, 3:, 3:] = np.eye(3)
+    by_first[:, 3:, :3] = -rigid.cross(poses[:, :3, 3] - start[:3, 3])
+
+    def spread(slopes: Array, covariance: Array) -> Array:
+        return slopes @ covariance @ np.swapaxes(slopes, 1, 2)
+
+    own = shared = None
+    if track.covariance is not None and reference.covariance is not None:
+        own = spread(by_body, track.covariance) + spread(by_reference, reference.covariance)
+    if own is not None and track.shared is not None and reference.shared is not None:
+        shared = spread(by_body, track.shared) + spread(by_reference + by_first, reference.shared)
+        if at_first.covariance is not None:
+            shared = shared + spread(by_first, at_first.covariance[first])
+    return Track(track.times, poses, own, shared)
+
+
+def _inverse(pose: Array) -> Array:
+    """Inverse of a pose; NaN of one that isn't known."""
+    return rigid.invert(pose) if np.isfinite(pose).all() else np.full((4, 4), np.nan)
 
 
 def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:

@@ -9,10 +9,11 @@ from recon.capture import target_files
 from recon.geometry.camera import Camera
 from recon.model.calibration import DRIFT_PX, Uncertainty
 from recon.model.part import Part
-from recon.model.rig import Rig, Target
+from recon.model.rig import PROBE, Rig, Target
 from recon.registry import Choice
 from recon.session.settings import BoardField, TargetField
 from recon.tracking import networks
+from recon.tracking.bodies import BodyTracker
 from recon.tracking.networks import OnnxNetworks
 from recon.tracking.tracker import Tracker
 
@@ -59,6 +60,16 @@ def target_of(fields: MeasuredTargetFields) -> Target:
     """The target as it was measured, else its design; InputError as of `recon.capture.target_files.read`."""
     design = fields.rig.target
     return design if fields.target is None else target_files.read(fields.target, design)
+
+
+def make_body_tracker(
+    fields: MeasuredTargetFields, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None
+) -> BodyTracker:
+    """The tracker of all bodies of a rig, of which the probe's target may have been measured; raises as `make_tracker`."""
+    loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads, fields.rig.target.kind, by_geometry=True)
+    targets = fields.rig.targets | {PROBE: target_of(fields)}
+    settings = bits, known, fields.drift_px, fields.board_scale
+    return BodyTracker({name: Tracker(cameras, target, loaded, *settings) for name, target in targets.items()})
 
 
 def make_tracker(

@@ -5,7 +5,7 @@ and, where circles may be smaller, finer levels of windows that overlap by what 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.geometry.ellipses import Ellipses
 from recon.tracking.networks import CELL, DETECTOR_SIZE, Networks
 
 Array = NDArray[np.float64]
@@ -104,16 +105,54 @@ class Candidates:
         away = np.linalg.norm(self.points[:, None] - places, axis=2).min(axis=1) > near
         return Candidates(self.points[away], self.scores[away], self.identity[away])
 
+    def unnamed(self, circles: int) -> "Candidates":
+        """The same without the network's word on which circle each is, of a target with a number of circles."""
+        return replace(self, identity=np.full((len(self.points), circles + 1), 1 / (circles + 1)))
 
-def detect(frames: Sequence[NDArray], windows: Sequence[Window], networks: Networks) -> list[Candidates]:
-    """Candidates in a window of each frame : (h, w) of 0 to 255, in px of the frame."""
+
+@dataclass(frozen=True)
+class Detections:
+    """What the detector sees in a pair of frames : (h, w) of 0 to 255: each window is looked at once, whoever asks."""
+
+    frames: tuple[NDArray, NDArray]
+    networks: Networks
+    most: int = MOST  # candidates of a window
+    named: bool = True  # whether the network's word on which circle each is counts
+    _seen: dict[tuple[int, Window], Candidates] = field(default_factory=dict, init=False, repr=False)
+    _taken: list[tuple[int, Ellipses]] = field(default_factory=list, init=False, repr=False)
+
+    def take(self, k: int, ellipses: Ellipses) -> None:
+        """Leave the circles of a body that is found in frame k out of what is seen from now on."""
+        self._taken.append((k, ellipses))
+
+    def candidates(self, places: Sequence[tuple[int, Window]], circles: int) -> list[Candidates]:
+        """Candidates in windows of frames : (k, window) of numbers k, in px of the frame, without circles that are taken.
+
+        circles : of the target, which has so many names
+        """
+        new = [place for place in dict.fromkeys(places) if place not in self._seen]
+        found = detect([self.frames[k] for k, _ in new], [window for _, window in new], self.networks, self.most)
+        self._seen.update(zip(new, found, strict=True))
+        free = [self._free(k, self._seen[k, window]) for k, window in places]
+        return free if self.named else [each.unnamed(circles) for each in free]
+
+    def _free(self, k: int, seen: Candidates) -> Candidates:
+        for number, ellipses in self._taken:
+            if number == k:
+                near = np.fmin.reduce(np.trace(ellipses.shape, axis1=1, axis2=2), initial=np.inf) / 2
+                seen = seen.apart_from(ellipses.centre, near)
+        return seen
+
+
+def detect(frames: Sequence[NDArray], windows: Sequence[Window], networks: Networks, most: int = MOST) -> list[Candidates]:
+    """Candidates in a window of each frame : (h, w) of 0 to 255, in px of the frame; `most` of each window, the surest."""
     found = []
     both = list(zip(frames, windows, strict=True))
     for first in range(0, len(both), AT_ONCE):
         some = both[first : first + AT_ONCE]
         detection, identity = networks.detect(np.stack([network_image(window.cut(frame)) for frame, window in some]))
         for where, who, (_, window) in zip(detection, identity, some, strict=True):
-            seen = read(where, who, FRAME[::-1])
+            seen = read(where, who, FRAME[::-1], most)
             found.append(Candidates(window.back(seen.points), seen.scores, seen.identity))
     return found
 
@@ -123,14 +162,14 @@ def network_image(frame: NDArray) -> NDArray[np.float32]:
     return cv2.resize(frame, DETECTOR_SIZE).astype(np.float32) / np.float32(255)
 
 
-def read(detection: NDArray, identity: NDArray, shape: tuple[int, ...]) -> Candidates:
+def read(detection: NDArray, identity: NDArray, shape: tuple[int, ...], most: int = MOST) -> Candidates:
     """Candidates from logits : (65, 30, 40) and (circles + 1, 30, 40), in px of a frame of (h, w)."""
     rows, columns = detection.shape[1:]
     within = _softmax(np.asarray(detection, float))[:-1].reshape(CELL, CELL, rows, columns)
     score = within.transpose(2, 0, 3, 1).reshape(rows * CELL, columns * CELL).astype(np.float32)
     highest = cv2.dilate(score, np.ones((2 * APART + 1, 2 * APART + 1), np.uint8))
     v, u = np.nonzero((score > LEAST_SCORE) & (score == highest))
-    best = np.argsort(-score[v, u], kind="stable")[:MOST]
+    best = np.argsort(-score[v, u], kind="stable")[:most]
     u, v = u[best], v[best]
     scale = np.array([shape[1] / (columns * CELL), shape[0] / (rows * CELL)])
     names = _softmax(np.asarray(identity, float))[:, v // CELL, u // CELL].T

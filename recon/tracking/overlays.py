@@ -1,6 +1,7 @@
 """Overlays of tracking results: ellipses, names, the target's axes, or the reason why there is none."""
 
 import math
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -28,14 +29,39 @@ def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Ca
         If it isn't an image.
     """
     picture = _picture(image)
+    _draw(picture, view, pose, camera)
+    reason = pose.reason if pose is not None else view.reason
+    if reason is not None:
+        _reason(picture, f"not found: {reason}", 0)
+    return picture
+
+
+def bodies_drawn(image: NDArray, found: Mapping[str, tuple[View, TargetPose]], camera: Camera) -> NDArray[np.uint8]:
+    """The same of several bodies by name, whose views and poses these are; a body without a name has none."""
+    picture, missing = _picture(image), 0
+    for name, (view, pose) in found.items():
+        _draw(picture, view, pose, camera, name)
+        if not pose.found:
+            _reason(picture, f"{name or 'not found'}: {pose.reason}", missing)
+            missing += 1
+    return picture
+
+
+def _draw(picture: NDArray[np.uint8], view: View, pose: TargetPose | None, camera: Camera | None, name: str = "") -> None:
     for k in range(len(view.outlines.reasons)):
         _ring(picture, view, k)
     if pose is not None and camera is not None and pose.found:
         _axes(picture, pose, camera)
-    reason = pose.reason if pose is not None else view.reason
-    if reason is not None:
-        _text(picture, f"not found: {reason}", (10, picture.shape[0] - 12), BAD, picture.shape[1] - 20)
-    return picture
+        if name:
+            (x, y), *_ = camera.project(pose.world_from_target[:3, 3][None])
+            if np.isfinite([x, y]).all():
+                _text(picture, name, (int(x) + 12, int(y) + 34), (255, 255, 255))
+
+
+def _reason(picture: NDArray[np.uint8], text: str, line: int) -> None:
+    """A reason at the lower edge, above so many others."""
+    high = round(28 * max(picture.shape[1] / 1100, 0.4))
+    _text(picture, text, (10, picture.shape[0] - 12 - line * high), BAD, picture.shape[1] - 20)
 
 
 def _picture(image: NDArray) -> NDArray[np.uint8]:

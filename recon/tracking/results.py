@@ -1,7 +1,7 @@
 """Results of tracking: a step of a kilobyte for each pair of frames, the track that the steps make, its tables and pictures."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from recon.tracking.tracker import Tracking
 Array = NDArray[np.float64]
 
 POSES, FRAMES, OVERLAYS = "poses.csv", "frames.csv", "overlays"
+BODIES = "bodies"  # folder of the same tables of further bodies, each in a folder of its name
 COLUMNS = (
     "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "shared_mm", "shared_deg", "blur_px_cam1",
     "blur_px_cam2", "reason",
@@ -80,9 +81,12 @@ def track_of(steps: Sequence[Step]) -> Track:
     )
 
 
-def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
-    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
-    sweep_tables.write_track(folder / POSES, track_of(steps))
+def write_poses(folder: Path, film: Film, steps: Sequence[Step], track: Track | None = None) -> None:
+    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not.
+
+    track : the poses, where they aren't those in camera 1's frame
+    """
+    sweep_tables.write_track(folder / POSES, track or track_of(steps))
     rows = (
         [step.time_ns, *numbers, int(step.found), step.how or "", *_numbers(step), step.reason or ""]
         for numbers, step in zip(film.frames.tolist(), steps, strict=True)
@@ -90,13 +94,13 @@ def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
     sweep_tables.write_rows(folder / FRAMES, COLUMNS, rows)
 
 
-def overlay(pair: Pair, found: Tracking, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
-    """Both views side by side : (h, w, 3) BGR, scaled down, with the results drawn in."""
-    shown = []
-    for image, view, camera in zip(pair, found.views, cameras, strict=True):
-        height = round(image.shape[0] * OVERLAY_WIDTH / image.shape[1])
-        size = (OVERLAY_WIDTH, height)
-        shown.append(cv2.resize(overlays.drawn(image, view, found.pose, camera), size, interpolation=cv2.INTER_AREA))
+def overlay(pair: Pair, found: Tracking | Mapping[str, Tracking], cameras: Sequence[Camera]) -> NDArray[np.uint8]:
+    """Both views side by side : (h, w, 3) BGR, scaled down, with the results drawn in, of several bodies with their names."""
+    shown, bodies = [], {"": found} if isinstance(found, Tracking) else found
+    for k, (image, camera) in enumerate(zip(pair, cameras, strict=True)):
+        size = (OVERLAY_WIDTH, round(image.shape[0] * OVERLAY_WIDTH / image.shape[1]))
+        drawn = overlays.bodies_drawn(image, {name: (one.views[k], one.pose) for name, one in bodies.items()}, camera)
+        shown.append(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA))
     tallest = max(len(each) for each in shown)
     return np.hstack([np.pad(each, ((0, tallest - len(each)), (0, 0), (0, 0))) for each in shown])
 

@@ -4,7 +4,7 @@ The limit by noise is `(n/C) sqrt(2 sqrt(pi) s / (pi R))` px along each axis for
 and radius R: 0.0012 px for n = 1, C = 100, s = 0.6, R = 45. `recon.tracking.rim_fit.rim_model` has the model that is fitted.
 """
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -114,8 +114,13 @@ class Outlines:
         """The same, with the one rim of `other` in place of number `which`."""
         order = np.arange(len(self.reasons))
         order[which] = len(order)
-        arrays = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in ARRAYS}
-        return Outlines(joined([self.ellipses, other.ellipses]), **arrays, reasons=self.reasons + other.reasons)[order]
+        return Outlines.joined([self, other])[order]
+
+    @classmethod
+    def joined(cls, parts: Sequence["Outlines"]) -> "Outlines":
+        """Rims one after the other."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+        return cls(joined([part.ellipses for part in parts]), **arrays, reasons=sum((part.reasons for part in parts), ()))
 
     def __getitem__(self, chosen) -> "Outlines":
         arrays = {name: getattr(self, name)[chosen] for name in ARRAYS}

@@ -8,6 +8,7 @@ of sizes against distances, and of both views against each other; so what is wro
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, Uncertainty, in_use
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
-from recon.tracking.circle_detector import Window
+from recon.tracking.circle_detector import Detections, Window
 from recon.tracking.frames import grey
 from recon.tracking.identity import Naming
 from recon.tracking.networks import Networks
@@ -74,6 +75,38 @@ class Tracking:
         return min((float(np.linalg.norm(other[:3, 3] - own)) for other in self.others), default=np.inf)
 
 
+class Moment(NamedTuple):
+    """When a pair was taken, and for how long what is known holds: in s, or in frames of pairs that come without times."""
+
+    now: float
+    forgotten: float = FORGOTTEN_S
+    gone: float = GONE_S
+    look: float = LOOK_S
+
+
+def paired(cameras: tuple[Camera, Camera], images: tuple[NDArray, NDArray], bits: int | None) -> Frames:
+    """A pair of frames, camera 1's and camera 2's, grey from 0 to 255.
+
+    Raises
+    ------
+    InputError
+        If one is no image, or of another size than its camera's, or both are the same.
+    """
+    frames = []
+    for number, (camera, image) in enumerate(zip(cameras, images, strict=True), start=1):
+        try:
+            frame = grey(image, bits)
+        except InputError as error:
+            raise InputError(f"camera {number}: {error}") from None
+        if frame.shape != camera.size[::-1]:
+            found = f"{frame.shape[1]}x{frame.shape[0]}"
+            raise InputError(f"camera {number}: expected an image of {camera.size[0]}x{camera.size[1]}, found {found}")
+        frames.append(frame)
+    if np.array_equal(frames[0][::SPARSE], frames[1][::SPARSE]) and frames[0].std() > 0:
+        raise InputError("both cameras show the same image to the last digit: is one camera's folder given for both?")
+    return frames[0], frames[1]
+
+
 def is_beside(apart_mm: float | None) -> bool:
     """Whether there is a further target, by `Tracking.apart_mm`."""
     return apart_mm is not None and bool(np.isfinite(apart_mm))
@@ -95,7 +128,7 @@ class Tracker:
     drift_px: float = DRIFT_PX  # standard deviation of principal points since the calibration; 0 of exact cameras
     board_scale: float | None = None  # relative, of the board of their calibration; None: as `optics` has it, or of paper
     _past: list[tuple[float, Array]] = field(default_factory=list, init=False)  # times and poses, the last one last, two at most
-    _disc_px: float | None = field(default=None, init=False)  # diameter when it was seen last
+    disc_px: float | None = field(default=None, init=False)  # diameter when it was seen last; None before
     _last: Array | None = field(default=None, init=False)  # the last pose, however old
     _looked: float | None = field(default=None, init=False)  # when a second target was looked for
     _missed: int = field(default=0, init=False)  # frames since then
@@ -125,46 +158,66 @@ class Tracker:
 
         Times must be given always or never; without them frames are evenly spaced.
         """
-        self._clock += 1
-        now, limit = (self._clock, FORGOTTEN_FRAMES) if time_s is None else (time_s, FORGOTTEN_S)
-        watch = _Watch()
+        watch, moment = _Watch(), self.begin(time_s)
         try:
-            frames = self._frames(left, right)
+            frames = paired(self.cameras, (left, right), self.bits)
         except InputError as error:
-            return Tracking(lost(str(error)), 2 * (views.nothing(str(error), self.count),), seconds=watch.seconds)
+            return replace(self.unseen(str(error)), seconds=watch.seconds)
         watch.stop("frames")
-        result = None
-        if self._past and 0 < now - self._past[-1][0] <= limit:
-            rough = self._rough(self._predicted(now))
-            if np.isfinite(rough.centre).all():
-                result = self._fitted(frames, rough, FOLLOWED if len(self._past) > 1 else BLIND, "predicted")
-                watch.stop("predict")
-                if not result.found and self.networks is not None:
-                    result = self._segmented(frames, self.networks, rough, result)
-                    watch.stop("segment")
-        if (result is None or not result.found) and self.networks is not None:
-            result = self._detected(frames, self.networks)
-            watch.stop("detect")
-        if result is None:
-            seen = 2 * (views.nothing(NO_NETWORKS, self.count),)
-            result = Tracking(lost(views.unseen(seen)), seen)
-        if result.found:
-            if self.networks is not None and self._is_due(result, now, LOOK_FRAMES if time_s is None else LOOK_S):
-                result, self._looked = self._nearest(result, self._beside(frames, self.networks, result)), now
+        result = self.follow(frames, moment, watch)
+        if self.networks is not None:
+            detections = Detections(frames, self.networks)
+            if result is None or not result.found:
+                result = self.find(detections)
+                watch.stop("detect")
+            if result.found and self._is_due(result, moment):
+                result, self._looked = self.nearest(result, self._beside(detections, result)), moment.now
                 watch.stop("look")
-            self._keep(result.pose.world_from_target, now, limit)
-            self._last = result.pose.world_from_target
-            self._disc_px = min(views.diameter(view.outlines.ellipses) for view in result.views)
-        else:
-            result = self._explained(result, now, GONE_FRAMES if time_s is None else GONE_S)
-        self._missed = 0 if result.found else self._missed + 1
-        return replace(result, seconds=watch.seconds)
+        return replace(self.keep(result or self.unseen(NO_NETWORKS), moment), seconds=watch.seconds)
 
-    def _explained(self, result: Tracking, now: float, limit: float) -> Tracking:
+    def begin(self, time_s: float | None) -> Moment:
+        """Begin a pair of a time in s, or the next of those that come without times."""
+        self._clock += 1
+        return Moment(self._clock, FORGOTTEN_FRAMES, GONE_FRAMES, LOOK_FRAMES) if time_s is None else Moment(time_s)
+
+    def follow(self, frames: Frames, moment: Moment, watch: "_Watch | None" = None) -> Tracking | None:
+        """Look where the last poses say that the target is: by its rims alone, then by the segmenter. None if they don't say."""
+        watch = watch or _Watch()
+        if not (self._past and 0 < moment.now - self._past[-1][0] <= moment.forgotten):
+            return None
+        rough = self._rough(self._predicted(moment.now))
+        if not np.isfinite(rough.centre).all():
+            return None
+        result = self._fitted(frames, rough, FOLLOWED if len(self._past) > 1 else BLIND, "predicted")
+        watch.stop("predict")
+        if not result.found and self.networks is not None:
+            result = self._segmented(frames, self.networks, rough, result)
+            watch.stop("segment")
+        return result
+
+    def keep(self, result: Tracking, moment: Moment) -> Tracking:
+        """Take the result of a pair as known; of one without a pose, with the reason that the last poses give."""
+        if result.found:
+            pose = result.pose.world_from_target
+            self._keep(pose, moment)
+            self._last = pose
+            self.disc_px = min(views.diameter(view.outlines.ellipses) for view in result.views)
+        else:
+            result = self._explained(result, moment)
+        self._missed = 0 if result.found else self._missed + 1
+        return result
+
+    def unseen(self, reason: str) -> Tracking:
+        """The result of a pair that isn't looked at, for a reason."""
+        nothing = views.nothing(reason, self.count)
+        return Tracking(lost(views.unseen((nothing, nothing)) if reason == NO_NETWORKS else reason), (nothing, nothing))
+
+    def _explained(self, result: Tracking, moment: Moment) -> Tracking:
         """A result without a pose, with the reasons that the last poses know: circles that have left a view, or got too small."""
-        if not self._past or not 0 < now - self._past[-1][0] <= limit or result.pose.reason != views.unseen(result.views):
+        gone = self._past and 0 < moment.now - self._past[-1][0] <= moment.gone
+        if not gone or result.pose.reason != views.unseen(result.views):
             return result
-        pose = self._predicted(now)
+        pose = self._predicted(moment.now)
         seen = [views.gone(view, self._expected(k, pose), self.cameras[k].size) for k, view in enumerate(result.views)]
         changed = seen[0], seen[1]
         if all(new is old for new, old in zip(changed, result.views, strict=True)):
@@ -173,33 +226,34 @@ class Tracker:
 
     def remember(self, world_from_target: Array, time_s: float | None = None) -> None:
         """Take a pose as known, of a time in s, or of the last frame where frames come without times."""
-        self._keep(world_from_target, *((self._clock, FORGOTTEN_FRAMES) if time_s is None else (time_s, FORGOTTEN_S)))
+        self._keep(world_from_target, Moment(self._clock, FORGOTTEN_FRAMES) if time_s is None else Moment(time_s))
 
-    def _keep(self, world_from_target: Array, now: float, limit: float) -> None:
-        steady = self._past and 0 < now - self._past[-1][0] <= limit
-        self._past = [*(self._past[-1:] if steady else []), (now, world_from_target)]
+    def _keep(self, world_from_target: Array, moment: Moment) -> None:
+        steady = self._past and 0 < moment.now - self._past[-1][0] <= moment.forgotten
+        self._past = [*(self._past[-1:] if steady else []), (moment.now, world_from_target)]
 
     def forget(self) -> None:
         """Clear the last poses."""
-        self._past, self._disc_px, self._missed, self._last, self._looked = [], None, 0, None, None
+        self._past, self.disc_px, self._missed, self._last, self._looked = [], None, 0, None, None
 
-    def _is_due(self, result: Tracking, now: float, every: float) -> bool:
+    def _is_due(self, result: Tracking, moment: Moment) -> bool:
         """Whether a second target is to be looked for: in the pair after the first that shows one, then now and then, and where a
         target that was lost is found again.
         """
         if result.how == "detected":
             return self._last is not None
-        return self._looked is None or not 0 <= now - self._looked < every
+        return self._looked is None or not 0 <= moment.now - self._looked < moment.look
 
-    def _beside(self, frames: Frames, networks: Networks, result: Tracking) -> list[Tracking]:
+    def _beside(self, detections: Detections, result: Tracking) -> list[Tracking]:
         """Further targets beside the one that is found, all of them by both views."""
+        frames, networks = detections.frames, detections.networks
         known = [view.outlines.ellipses for view in result.views]
         wide = min(map(views.diameter, known))
         windows = [
             each[circle_detector.usual_level(each, wide)] for each in map(circle_detector.levels, (c.size for c in self.cameras))
         ]
         places = [(k, window) for k, each in enumerate(windows) for window in each]
-        seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
+        seen = detections.candidates(places, self.count)
         choices = [
             (k, naming)
             for (k, window), candidates in zip(places, seen, strict=True)
@@ -210,16 +264,16 @@ class Tracker:
         for k, naming in sorted(choices, key=lambda choice: -choice[1].score)[:OTHERS]:
             view = self._seen_at(frames, networks, k, naming)
             again = self._confirmed(frames, k, view) if view.found else None
-            if again is not None and all(self._differ(again, other) for other in (result, *found)):
+            if again is not None and all(self.differ(again, other) for other in (result, *found)):
                 found.append(again)
         return found
 
-    def _differ(self, one: Tracking, other: Tracking) -> bool:
+    def differ(self, one: Tracking, other: Tracking) -> bool:
         """Whether two results are of two targets."""
         way = one.pose.world_from_target[:3, 3] - other.pose.world_from_target[:3, 3]
         return bool(np.linalg.norm(way) > APART_DISCS * self.target.outer_diameter_mm)
 
-    def _nearest(self, result: Tracking, others: Sequence[Tracking]) -> Tracking:
+    def nearest(self, result: Tracking, others: Sequence[Tracking]) -> Tracking:
         """Of several targets the one nearest to the last pose, else the first; the others beside it."""
         all_of_them = [result, *others]
         if self._last is not None:
@@ -230,24 +284,9 @@ class Tracker:
     def _confirmed(self, frames: Frames, k: int, view: View) -> Tracking | None:
         """The pose by camera k's view and the other's at the circles that it predicts; None if these show none."""
         results = [
-            self._posed((view, other) if k == 0 else (other, view), "detected") for other in self._opposite_views(frames, k, view)
+            self.posed((view, other) if k == 0 else (other, view), "detected") for other in self._opposite_views(frames, k, view)
         ]
-        return min((one for one in results if one.found), key=_rank, default=None)
-
-    def _frames(self, left: NDArray, right: NDArray) -> Frames:
-        frames = []
-        for number, (camera, image) in enumerate(zip(self.cameras, (left, right), strict=True), start=1):
-            try:
-                frame = grey(image, self.bits)
-            except InputError as error:
-                raise InputError(f"camera {number}: {error}") from None
-            if frame.shape != camera.size[::-1]:
-                found = f"{frame.shape[1]}x{frame.shape[0]}"
-                raise InputError(f"camera {number}: expected an image of {camera.size[0]}x{camera.size[1]}, found {found}")
-            frames.append(frame)
-        if np.array_equal(frames[0][::SPARSE], frames[1][::SPARSE]) and frames[0].std() > 0:
-            raise InputError("both cameras show the same image to the last digit: is one camera's folder given for both?")
-        return frames[0], frames[1]
+        return min((one for one in results if one.found), key=rank, default=None)
 
     def _predicted(self, now: float) -> Array:
         """Pose at a moment, by constant velocity : (4, 4) mm."""
@@ -275,24 +314,24 @@ class Tracker:
             covered_circle.completed(*each, self.target)
             for each in zip(frames, (outlines[: self.count], outlines[self.count :]), strict=True)
         ]
-        seen = (self._judged(0, halves[0]), self._judged(1, halves[1]))
+        seen = (self.judged(0, halves[0]), self.judged(1, halves[1]))
         return self._settled(frames, seen, how)
 
     def _settled(self, frames: Frames, seen: Views, how: str) -> Tracking:
         """From two views to the pose; where they give none, by a second look for circles that something covers."""
-        result = self._posed(seen, how)
+        result = self.posed(seen, how)
         if result.found:
             return result
         rims = [view.outlines for view in seen]
         for choices in covered_circle.sought_again(frames, rims, self.cameras, self.target, self.optics_in_use):
-            judged = [(self._judged(0, one), self._judged(1, other)) for one, other in choices]
-            found = [each for each in (self._posed((one, other), how) for one, other in judged) if each.found]
+            judged = [(self.judged(0, one), self.judged(1, other)) for one, other in choices]
+            found = [each for each in (self.posed((one, other), how) for one, other in judged) if each.found]
             if found:
-                best = min(found, key=_rank)
+                best = min(found, key=rank)
                 return best if all(same(best.pose, each.pose) for each in found) else result
         return result
 
-    def _posed(self, seen: Views, how: str) -> Tracking:
+    def posed(self, seen: Views, how: str) -> Tracking:
         """From two views to the pose."""
         if not (all(view.useful for view in seen) and any(view.found for view in seen)):
             each = self._unconfirmed(seen)
@@ -330,21 +369,21 @@ class Tracker:
             return before
         return self._fitted(frames, joined(halves), circle_segmenter.OFF, "segmented")
 
-    def _detected(self, frames: Frames, networks: Networks) -> Tracking:
+    def find(self, detections: Detections) -> Tracking:
         """Search both frames, level by level of what the detector sees of them."""
         levels = [circle_detector.levels(camera.size) for camera in self.cameras]
-        usual = [circle_detector.usual_level(each, self._disc_px) for each in levels]
+        usual = [circle_detector.usual_level(each, self.disc_px) for each in levels]
         result, shown = None, list[tuple[bool, int]]()
         for number in range(max(map(len, levels))):
             windows = [each[number] if number < len(each) else () for each in levels]
             if number and not self._at_any_size() and number not in usual:
                 continue
-            seen = self._detected_in(frames, networks, windows)
+            seen = self._detected_in(detections, windows)
             if isinstance(seen, Tracking):
                 return seen
             most = sorted(map(_shown, seen), reverse=True)
             if result is None or most > shown:
-                result, shown = self._settled(frames, seen, "detected"), most
+                result, shown = self._settled(detections.frames, seen, "detected"), most
             if any(view.found for view in result.views) or all(view.found for view in seen):
                 return result  # its size is known, so finer levels show nothing else
         assert result is not None  # there is a level of the whole frame
@@ -352,15 +391,16 @@ class Tracker:
 
     def _at_any_size(self) -> bool:
         """Whether the target may be of any size: now and then, as a search for small circles takes its time."""
-        return self._missed % ALL_LEVELS == (0 if self._disc_px is None else ALL_LEVELS - 1)
+        return self._missed % ALL_LEVELS == (0 if self.disc_px is None else ALL_LEVELS - 1)
 
-    def _detected_in(self, frames: Frames, networks: Networks, windows: Sequence[Sequence[Window]]) -> Tracking | Views:
+    def _detected_in(self, detections: Detections, windows: Sequence[Sequence[Window]]) -> Tracking | Views:
         """Search windows of both frames; verify each pose hypothesis (P3P) of one view in the other.
 
         Without a pose the views that show most of the target.
         """
+        frames, networks = detections.frames, detections.networks
         places = [(k, window) for k, each in enumerate(windows) for window in each]
-        seen = circle_detector.detect([frames[k] for k, _ in places], [window for _, window in places], networks)
+        seen = detections.candidates(places, self.count)
         choices = [
             (k, naming)
             for (k, window), candidates in zip(places, seen, strict=True)
@@ -378,7 +418,7 @@ class Tracker:
             if view.found:
                 settled[k] = naming
                 others = self._opposite_views(frames, k, view)
-                results = [self._posed((view, other) if k == 0 else (other, view), "detected") for other in others]
+                results = [self.posed((view, other) if k == 0 else (other, view), "detected") for other in others]
                 if any(result.found for result in results):
                     return _likeliest(results)
                 likeliest.update((1 - k, other) for other in others if other.found)
@@ -389,17 +429,17 @@ class Tracker:
         """Views of the other camera at the circles that each pose hypothesis of camera k's view predicts."""
         poses = pose_hypotheses.poses(self.cameras[k], view.outlines.rings.centre, circle_layout.circle_centres(self.target))
         expected = [self._expected(1 - k, pose) for pose in poses]
-        return [self._judged(1 - k, self._view(frames, 1 - k, rough, FOLLOWED)) for rough in expected]
+        return [self.judged(1 - k, self._view(frames, 1 - k, rough, FOLLOWED)) for rough in expected]
 
     def _seen_at(self, frames: Frames, networks: Networks, k: int, naming: Naming) -> View:
         """View of one camera at predicted places of its circles."""
         rough = circle_segmenter.rough_ellipses(frames[k], naming.points, networks, self.target)
         rims = measure(frames[k], rough, reach_px(rough, circle_segmenter.OFF), self.target)
         rims = covered_circle.named_and_completed(frames[k], rims, self.target)
-        view, wide = self._judged(k, views.renamed(rims, self.target, self.cameras[k])), views.diameter(rough)
+        view, wide = self.judged(k, views.renamed(rims, self.target, self.cameras[k])), views.diameter(rough)
         return replace(view, reason=views.too_small(wide)) if not view.found and wide < circle_detector.LEAST_PX else view
 
-    def _judged(self, k: int, outlines: Outlines) -> View:
+    def judged(self, k: int, outlines: Outlines) -> View:
         """Camera k's view of some rims."""
         return views.judged(outlines, self.target, self.cameras[k])
 
@@ -420,14 +460,14 @@ class _Watch:
         self.seconds[stage], self.since = now - self.since, now
 
 
-def _rank(result: Tracking) -> tuple[int, float]:
+def rank(result: Tracking) -> tuple[int, float]:
     """To find the right tilt first: a wrong one misses circles, or else fits worse."""
     return -result.pose.freedom, result.pose.misfit
 
 
 def _likeliest(results: Sequence[Tracking]) -> Tracking:
     """Of results by several hypotheses the one found that ranks first; none if another pose fits as many circles as well."""
-    best, *others = sorted((one for one in results if one.found), key=_rank)
+    best, *others = sorted((one for one in results if one.found), key=rank)
     rivals = [
         one.pose for one in others if one.pose.freedom == best.pose.freedom and one.pose.misfit < best.pose.misfit + DISTINCT
     ]

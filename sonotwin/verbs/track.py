@@ -31,5 +31,6 @@ class Config(poses_step.Settings):
 
 
 def run(config: Config) -> int:
-    """Read, track and write, as `recon.session.poses_step.run`; returns 1 if no pair shows the target."""
-    return int(not any(step.found for step in poses_step.run(config, config.out, ConsoleWatch())))
+    """Read, track and write, as `recon.session.poses_step.run`; returns 1 if no pair shows a body."""
+    steps = poses_step.run(config, config.out, ConsoleWatch())
+    return int(not any(step.found for own in steps.values() for step in own))

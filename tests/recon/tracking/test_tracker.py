@@ -180,7 +180,7 @@ def test_of_two_poses_the_one_of_more_circles_is_taken_then_the_better_fit(track
     worse = replace(found, pose=replace(found.pose, misfit=found.pose.misfit + 1))
     fewer = replace(found, pose=replace(found.pose, misfit=0.0, freedom=found.pose.freedom - 2))
     for order in ([worse, fewer, found], [found, fewer, worse]):
-        assert min(order, key=tracking._rank) is found
+        assert min(order, key=tracking.rank) is found
 
 
 def test_circles_that_one_view_shows_are_looked_at_once(cameras, rig, pair):

@@ -1,0 +1,193 @@
+"""All bodies of a rig in pairs of frames: each is followed by a tracker of its own, and what is lost is searched for in common.
+
+The networks look at a pair once, whatever the number of bodies. Rings that belong to no body that is followed are fitted, and
+where their rays meet, distances tell the bodies (`recon.tracking.constellations`). A body of which something covers circles is
+then left to its own tracker's search, among the circles that are left.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import InputError
+from recon.model import circle_layout
+from recon.model.rig import parted_mm
+from recon.threads import mapped
+from recon.tracking import circle_detector, constellations
+from recon.tracking.circle_detector import Detections
+from recon.tracking.constellations import Points
+from recon.tracking.pose import DISTINCT, GROSS_MM, distances
+from recon.tracking.pose_fit import lost
+from recon.tracking.rims import Outlines
+from recon.tracking.tracker import NO_NETWORKS, Moment, Tracker, Tracking, paired, rank
+from recon.tracking.views import doubted
+
+Array = NDArray[np.float64]
+
+CIRCLES = 40  # candidates of a window, of all bodies and of what else is round
+
+
+class _Claim(NamedTuple):
+    """A body at some rings."""
+
+    name: str
+    result: Tracking
+    rings: frozenset[tuple[int, int]]  # view and number
+
+
+@dataclass
+class BodyTracker:
+    """Follows several bodies through pairs of frames; see `Tracker`, of which each body has one."""
+
+    trackers: Mapping[str, Tracker]  # by the body's name, all of the same cameras and networks
+    search_s: float = 0.0  # least time from one search for what is lost to the next, while another body is followed
+    _searched: float | None = field(default=None, init=False)
+    _looked: float | None = field(default=None, init=False)  # when further bodies of the designs were looked for
+
+    def step(self, left: NDArray, right: NDArray, time_s: float | None = None) -> dict[str, Tracking]:
+        """Track one pair of frames, camera 1's and camera 2's, as `Tracker.step`; the result of each body by its name."""
+        start = perf_counter()
+        first = next(iter(self.trackers.values()))
+        (moment, *_) = [tracker.begin(time_s) for tracker in self.trackers.values()]
+        try:
+            frames = paired(first.cameras, (left, right), first.bits)
+        except InputError as error:
+            return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
+        results = dict(zip(self.trackers, mapped(lambda one: one.follow(frames, moment), self.trackers.values()), strict=True))
+        found = {name: result for name, result in results.items() if result is not None and result.found}
+        if first.networks is not None and self._is_due(found, moment, time_s is not None):
+            results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
+            self._searched = moment.now
+        kept = {
+            name: tracker.keep(results[name] or tracker.unseen(NO_NETWORKS), moment) for name, tracker in self.trackers.items()
+        }
+        seconds = {"bodies": (perf_counter() - start) / len(kept)}
+        return {name: replace(result, seconds=seconds) for name, result in kept.items()}
+
+    def forget(self) -> None:
+        """Clear the last poses."""
+        self._searched = self._looked = None
+        for tracker in self.trackers.values():
+            tracker.forget()
+
+    def _is_due(self, found: Mapping[str, Tracking], moment: Moment, timed: bool) -> bool:
+        """Whether to search: for what is lost, and now and then for a second body of a design."""
+        if self._looked is None or not 0 <= moment.now - self._looked < moment.look:
+            self._looked = moment.now
+            return True
+        if len(found) == len(self.trackers):
+            return False
+        waiting = found and timed and self._searched is not None and 0 <= moment.now - self._searched < self.search_s
+        return not waiting
+
+    def _searched_for(self, detections: Detections, found: Mapping[str, Tracking]) -> dict[str, Tracking]:
+        """Results of the bodies that aren't found yet, and those of the others with further bodies of their design."""
+        for result in found.values():
+            _take(detections, result)
+        claims = self._claims(*self._rings(detections))
+        settled = _settled([claim for claim in claims if claim.name not in found])
+        settled += _free([claim for claim in claims if claim.name in found], settled)
+        results, others = dict(found), {name: list[Tracking]() for name in self.trackers}
+        for name, result, _ in settled:
+            if name in results:
+                others[name].append(result)
+            else:
+                results[name] = result
+                _take(detections, result)
+        for name, further in others.items():
+            if any(one.found for one in further) or (name in results and results[name].found):
+                results[name] = self.trackers[name].nearest(results[name], [one for one in further if one.found])
+        for name, tracker in self.trackers.items():
+            if name not in results:
+                results[name] = self._told(name, tracker.find(detections), results)
+                _take(detections, results[name])
+        return results
+
+    def _told(self, name: str, result: Tracking, results: Mapping[str, Tracking]) -> Tracking:
+        """A body of which circles are covered, unless those in both views may be those of another one that isn't found."""
+        if not result.found or result.pose.used.all():
+            return result
+        target = self.trackers[name].target
+        both = circle_layout.circle_centres(target)[result.pose.used.all(axis=0)]
+        for rival, tracker in self.trackers.items():
+            away = rival != name and not (rival in results and results[rival].found)
+            if (
+                away
+                and np.isfinite(parted_mm(target, tracker.target))
+                and _alike(both, circle_layout.circle_centres(tracker.target))
+            ):
+                pose = lost(f"circles seen in part, that may be those of the {rival}")
+                return Tracking(pose, doubted(result.views, pose.reason))
+        return result
+
+    def _rings(self, detections: Detections) -> tuple[tuple[Outlines, Outlines], Points]:
+        """All rings of both views, in windows in which circles are as large as usual, and the points where their rays meet."""
+        first = next(iter(self.trackers.values()))
+        known = [tracker.disc_px for tracker in self.trackers.values() if tracker.disc_px is not None]
+        rings = []
+        for k, camera in enumerate(first.cameras):
+            windows = circle_detector.levels(camera.size)
+            level = windows[circle_detector.usual_level(windows, min(known, default=None))]
+            seen = detections.candidates([(k, window) for window in level], first.count)
+            places = np.concatenate([each.points for each in seen])
+            rings.append(constellations.rings_of(detections.frames[k], places, detections.networks, first.target))
+        both = rings[0], rings[1]
+        return both, constellations.points_of(both, first.cameras)
+
+    def _claims(self, rings: tuple[Outlines, Outlines], points: Points) -> list[_Claim]:
+        """Each body at all rings that a pose of it fits."""
+        claims = []
+        for name, tracker in self.trackers.items():
+            for choice in constellations.choices(points, tracker.target):
+                one, other = constellations.chosen_rims(rings, points, choice)
+                result = tracker.posed((tracker.judged(0, one), tracker.judged(1, other)), "detected")
+                if result.found:
+                    taken = frozenset((k, ring) for k in (0, 1) for ring in points.rings[choice[choice >= 0], k].tolist())
+                    claims.append(_Claim(name, result, taken))
+        return claims
+
+
+def _settled(claims: Sequence[_Claim]) -> list[_Claim]:
+    """Claims that share no rings, the surest first; where two bodies fit the same rings as well, neither is told."""
+    settled: list[_Claim] = []
+    for claim in sorted(claims, key=lambda claim: rank(claim.result)):
+        rivals = [one for one in settled if one.rings & claim.rings]
+        if not rivals:
+            settled.append(claim)
+        elif rivals[0].name != claim.name and _as_well(claim.result, rivals[0].result):
+            pose = lost(f"circles of the {rivals[0].name}, or of the {claim.name}: no distance tells which")
+            told = Tracking(pose, doubted(claim.result.views, pose.reason))
+            settled = [one._replace(result=told) if one is rivals[0] else one for one in settled]
+            settled.append(claim._replace(result=told))
+    return settled
+
+
+def _free(claims: Sequence[_Claim], settled: Sequence[_Claim]) -> list[_Claim]:
+    """Claims that share no rings with each other or with those that are settled, the surest first."""
+    free: list[_Claim] = []
+    for claim in sorted(claims, key=lambda claim: rank(claim.result)):
+        if not any(one.rings & claim.rings for one in (*settled, *free)):
+            free.append(claim)
+    return free
+
+
+def _as_well(one: Tracking, other: Tracking) -> bool:
+    """Whether a pose fits as many circles about as well as another."""
+    return other.found and one.pose.freedom >= other.pose.freedom and one.pose.misfit < other.pose.misfit + DISTINCT
+
+
+def _alike(places: Array, others: Array) -> bool:
+    """Whether each distance between places : (k, 3) mm is nearly one between others : (n, 3) mm."""
+    off = np.abs(distances(places)[:, None] - distances(others))
+    return bool((off.min(axis=1, initial=np.inf) < GROSS_MM).all())
+
+
+def _take(detections: Detections, result: Tracking) -> None:
+    """Leave the circles of a body that is found out of the detections."""
+    if result.found:
+        for k, view in enumerate(result.views):
+            detections.take(k, view.outlines.ellipses)
