@@ -134,7 +134,7 @@ def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
         motion=motion,
         body=int(rng.integers(ranges.variants)),
         surroundings=int(rng.integers(ranges.variants)),
-        scene_from_world=_scene_from_world(pose, rng),
+        scene_from_world=scene_behind(pose[:3, 3], rng),
         lighting=_lighting(ranges.light, pose, rng),
         surfaces=_surfaces(rng),
         texture_shift=rng.uniform(-500, 500, 3),
@@ -256,13 +256,13 @@ def _motion(ranges: PoseRanges, pose: Array, camera: Camera, rng: np.random.Gene
     return Motion(pose, direction * path, turn)
 
 
-def _scene_from_world(pose: Array, rng: np.random.Generator) -> Array:
-    """The table's top lies behind the target, seen from above or from the side by up to 50 degrees."""
+def scene_behind(place: Array, rng: np.random.Generator) -> Array:
+    """`scene_from_world`, its table's top behind a place : (3,) mm, seen from above or from the side by up to 50 degrees."""
     up = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)])
     lean = Rotation.from_rotvec(np.deg2rad(50) * rng.random() ** 2 * _around(rng))
     world_from_scene = rigid.transform((lean * Rotation.from_rotvec([np.pi, 0, 0]) * up).as_matrix(), np.zeros(3))
-    behind = pose[2, 3] + rng.uniform(60, 330)
-    world_from_scene[:3, 3] = [pose[0, 3] + rng.normal(0, 60), pose[1, 3] + rng.normal(0, 60), behind]
+    behind = place[2] + rng.uniform(60, 330)
+    world_from_scene[:3, 3] = [place[0] + rng.normal(0, 60), place[1] + rng.normal(0, 60), behind]
     return rigid.invert(world_from_scene)
 
 
