@@ -5,17 +5,18 @@ from dataclasses import replace
 
 from recon.errors import InputError
 from twin.experiments.experiment_setup import Setup
-from twin.shooting import Quality
-from twin.tracking.mesh_bank import build_bank
-from twin.tracking.rendered_views import Frames, render_full, render_sketches
+from twin.shooting import FilmQuality, Quality
+from twin.tracking.mesh_bank import build_bank, build_bodies
+from twin.tracking.rendered_views import Frames, render_film, render_full, render_sketches
 from twin.tracking.samples import Take, draw
 from twin.tracking.sampling_ranges import DataRanges
-from twin.tracking.study_samples import study_take
+from twin.tracking.study_samples import BLUR_PX, WHITE_DN, bodies_take, study_take
 from twin.tracking.surface_prints import BitGrid
 
 BATCH = 4  # takes in one launch
 STUDY_VARIANTS = 12  # of bodies and surroundings
 MOST_TRIES = 50  # poses for each that shows the target whole
+FINE = FilmQuality(rim=16)  # of several bodies
 WHOLLY = 0.999  # of each disc: what a study asks to be seen of them
 
 
@@ -64,3 +65,24 @@ def study(
         given += len(clear)
         if clear:
             yield from zip(clear, render_sketches(bank, setup.rig, clear, Quality(window=rays), seed, grid), strict=True)
+
+
+def several(
+    setup: Setup,
+    seed: int,
+    count: int,
+    white_dn: tuple[float, float] = WHITE_DN,
+    blur_px: tuple[float, float] = BLUR_PX,
+    quality: FilmQuality = FINE,
+) -> Iterator[tuple[Take, Frames]]:
+    """Pairs of frames with all bodies of the rig, over the whole working volume; pair k depends on (seed, k) alone.
+
+    Poses are those of `Take.held`, truth that of `Frames.bodies`, both by bodies' names. No circle is covered; light and blur lie
+    within ranges, see `bodies_take`.
+    """
+    ranges = ranges_of(setup).model_copy(update={"variants": STUDY_VARIANTS})
+    bank = build_bodies(setup.rig, STUDY_VARIANTS, seed)
+    for first in range(0, count, BATCH):
+        numbers = range(first, min(first + BATCH, count))
+        takes = [bodies_take(bank, setup.rig, ranges, seed, k, white_dn, blur_px) for k in numbers]
+        yield from zip(takes, render_film(bank, setup.rig, takes, quality, seed), strict=True)

@@ -9,7 +9,7 @@ paper it would scatter by a tenth. So it is averaged over the cells about each, 
 what the surface reflects is not averaged, and keeps its edges.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.model.rig import CameraDevice, Target
 from twin.shooting import FilmQuality
-from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light
+from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, circle_number
 from twin.tracking.pixel_selection import joined, lanes_of
-from twin.tracking.samples import Take
+from twin.tracking.samples import Held, Take
 from twin.tracking.target_truth import ViewTruth, board_corners
 
 Array = NDArray[np.float64]
@@ -75,7 +75,7 @@ class Pixels:
     u: NDArray[np.int64]  # (n,)
     v: NDArray[np.int64]
     samples: NDArray[np.int64]
-    circle: NDArray[np.int64]  # the one that is nearest, or NO_CIRCLE
+    circle: NDArray[np.int64]  # `circle_number` of the one that is nearest, or NO_CIRCLE
 
     def lanes(self, take: int, camera: int) -> Lanes:
         """Lanes in the same order."""
@@ -110,23 +110,29 @@ class FilmPicture:
 
 
 def film_picture(
-    take: Take, device: CameraDevice, late: float, target: Target, truth: ViewTruth, quality: FilmQuality
+    take: Take,
+    device: CameraDevice,
+    late: float,
+    targets: Mapping[str, Target],
+    truth: Mapping[str, ViewTruth],
+    quality: FilmQuality,
 ) -> FilmPicture:
-    """Layers for a take's frame by one camera, which exposes later by a share of the exposure."""
-    size = device.optics.size
-    whole = Cells((0, 0), size, CELL_PX, quality.view)
-    near = about_target(take, device, late, target) if take.present else None
-    if near is None:
-        return FilmPicture(size, [whole])
-    corners = device.optics.camera().project(rigid.apply(take.motion.later(late).world_from_target, board_corners(target)))
-    return FilmPicture(
-        size, [whole, Cells(*near, NEAR_CELL_PX, quality.view), sharp_pixels(truth, corners, size, target, quality)]
-    )
+    """Layers for a take's frame by one camera, which exposes later by a share of the exposure; targets and truth by body."""
+    size, camera = device.optics.size, device.optics.camera()
+    about, sharp = [], []
+    for number, (name, held) in enumerate(take.held.items()):
+        target = targets[name]
+        near = about_target(held, device, late, target) if held.present else None
+        if near is not None:
+            about.append(Cells(*near, NEAR_CELL_PX, quality.view))
+            corners = camera.project(rigid.apply(held.motion.later(late).world_from_target, board_corners(target)))
+            sharp.append(sharp_pixels(truth[name], corners, size, target, quality, number))
+    return FilmPicture(size, [Cells((0, 0), size, CELL_PX, quality.view), *about, *sharp])
 
 
-def about_target(take: Take, device: CameraDevice, late: float, target: Target) -> tuple[tuple[int, int], tuple[int, int]] | None:
+def about_target(held: Held, device: CameraDevice, late: float, target: Target) -> tuple[tuple[int, int], tuple[int, int]] | None:
     """First pixel, and width and height, of the rectangle about the board on its way; None where the image shows none of it."""
-    motion, camera, size = take.motion.later(late), device.optics.camera(), np.array(device.optics.size)
+    motion, camera, size = held.motion.later(late), device.optics.camera(), np.array(device.optics.size)
     places = np.concatenate([camera.project(rigid.apply(motion.at(time), board_corners(target))) for time in (-0.5, 0.5)])
     if not np.isfinite(places).all():
         return None
@@ -135,9 +141,11 @@ def about_target(take: Take, device: CameraDevice, late: float, target: Target) 
     return (tuple(low.astype(int).tolist()), tuple(extent.astype(int).tolist())) if extent.min() >= 2 else None
 
 
-def sharp_pixels(truth: ViewTruth, corners: Array, size: tuple[int, int], target: Target, quality: FilmQuality) -> Pixels:
-    """Pixels of the board's edges, between its corners : (4, 2) px, and of the circles, as far out as a fit of their rims looks,
-    with more rays at outer and inner rims.
+def sharp_pixels(
+    truth: ViewTruth, corners: Array, size: tuple[int, int], target: Target, quality: FilmQuality, body: int = 0
+) -> Pixels:
+    """Pixels of the edges of a body's board, between its corners : (4, 2) px, and of the circles, as far out as a fit of their
+    rims looks, with more rays at outer and inner rims.
     """
     ratio = target.inner_diameter_mm / target.outer_diameter_mm
     edges = np.zeros(size[::-1], np.uint8)
@@ -145,7 +153,7 @@ def sharp_pixels(truth: ViewTruth, corners: Array, size: tuple[int, int], target
     cv2.polylines(edges, [np.rint(corners).astype(np.int32)], isClosed=True, color=1, thickness=width)
     v, u = edges.nonzero()
     found = [np.column_stack([u, v, *(np.full(u.size, value) for value in (quality.disc, NO_CIRCLE, np.inf))])]
-    for number, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
+    for k, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
         reach = row[2] * (1 + BEYOND) + path
         low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)
         high = np.clip(np.ceil(row[:2] + reach) + 1, 0, size).astype(int)
@@ -154,7 +162,7 @@ def sharp_pixels(truth: ViewTruth, corners: Array, size: tuple[int, int], target
         beyond = (radius - 1) * row[3] - path / 2
         at_rim = np.minimum(np.abs(radius - 1), np.abs(radius - ratio)) * row[3] < RIM_PX + path / 2
         rays = np.where(at_rim, quality.rim, quality.disc)
-        found.append(np.column_stack([u, v, rays, np.full(u.size, number), radius])[beyond < BEYOND * row[3]])
+        found.append(np.column_stack([u, v, rays, np.full(u.size, circle_number(body, k)), radius])[beyond < BEYOND * row[3]])
     table = np.concatenate(found)
     table = table[np.argsort(table[:, 4], kind="stable")]  # of pixels that two circles share, those of the nearer
     _, kept = np.unique(table[:, 1] * size[0] + table[:, 0], return_index=True)
@@ -168,7 +176,7 @@ def most_rays(quality: FilmQuality) -> int:
 
 
 def visible_shares(lanes: Lanes, light: Light, count: int) -> Array:
-    """Uncovered share of each disc's area within the image : (n,) of a number of circles."""
+    """Uncovered share of each disc's area within the image : (n,), by `circle_number` up to a number of them."""
     of_one = lanes.circle != NO_CIRCLE
     seen, disc = (np.bincount(lanes.circle[of_one], (part / lanes.samples)[of_one], count) for part in (light.seen, light.disc))
     return seen / np.maximum(disc, 1)

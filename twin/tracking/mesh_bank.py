@@ -3,7 +3,7 @@
 A sample picks its variants by their places; nothing is built or torn down between samples, so memory stays flat.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import Target
+from recon.model.rig import Rig, Target
+from scenes.handheld.body_look import any_stand, look_of
 from scenes.handheld.handheld_assembly import held
 from scenes.handheld.mesh_parts import Merged, Part, merged
 from scenes.handheld.surroundings import Surroundings, surroundings
+from twin.tracking.samples import Take
 from twin.tracking.surface_prints import STRIDE_MM
 from twin.tracking.target_truth import outline
 
@@ -44,6 +46,16 @@ def build_bank(target: Target, variants: int, seed: int) -> Bank:
     """Make the variants of a data set, by its seed alone; once in a process."""
     streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in (0, 1)]
     bodies = [held(streams[0], target) for _ in range(variants)]
+    return bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)])
+
+
+@lru_cache(maxsize=2)
+def build_bodies(rig: Rig, variants: int, seed: int) -> Bank:
+    """Make variants of all of a rig's bodies : body n's are those from n times their number on; once in a process."""
+    streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in range(2 + len(rig.bodies))]
+    bodies = [held(streams[0], rig.target) for _ in range(variants)]
+    for stream, (name, target) in zip(streams[2:], rig.bodies.items(), strict=True):
+        bodies += [look_of(name).parts(stream, target, any_stand(stream)) for _ in range(variants)]
     return bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)])
 
 
@@ -74,6 +86,27 @@ def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
     ray = mi.Ray3f(mi.Point3f(*np.float32(start + bank.body_at[body]).T), mi.Vector3f(*np.float32(ways / distance[:, None]).T))
     ray.maxt = mi.Float(np.float32(distance))
     return 1 - float(np.mean(np.array(bank.bodies.ray_test(ray, dr.full(mi.Bool, True, len(start))))))
+
+
+def all_uncovered(bank: Bank, take: Take, targets: Mapping[str, Target], eyes: Array) -> bool:
+    """Whether eyes : (n, 3) mm in the world see all circles' rims past all bodies and surroundings, in mid-exposure."""
+    poses = {name: held.motion.world_from_target for name, held in take.held.items()}
+    rims = []
+    for name, pose in poses.items():
+        lifted = circle_centres(targets[name]) + np.array([0, 0, LIFT_MM])
+        rims.append(rigid.apply(pose, outline(lifted, targets[name].outer_diameter_mm / 2).reshape(-1, 3)))
+    rim = np.concatenate(rims)
+    start = np.tile(rim, (len(eyes), 1))
+    ways = np.repeat(eyes, len(rim), axis=0) - start
+    distance = np.linalg.norm(ways, axis=1, keepdims=True)
+    worlds = [(bank.bodies, rigid.invert(poses[name]), bank.body_at[held.body]) for name, held in take.held.items()]
+    for world, into, at in (*worlds, (bank.scenes, take.scene_from_world, bank.scene_at[take.surroundings])):
+        place, way = rigid.apply(into, start) + at, rigid.rotate(into, ways / distance)
+        ray = mi.Ray3f(mi.Point3f(*np.float32(place).T), mi.Vector3f(*np.float32(way).T))
+        ray.maxt = mi.Float(np.float32(distance.ravel()))
+        if np.array(world.ray_test(ray, dr.full(mi.Bool, True, len(start)))).any():
+            return False
+    return True
 
 
 def _places(count: int, pitch: float) -> Array:

@@ -1,8 +1,9 @@
-"""Light from lamps, surroundings and projector, by a held body that moves and a scene that stands still, to camera pixels.
+"""Light from lamps, surroundings and projector, by held bodies that move and a scene that stands still, to camera pixels.
 
-Body and scene are two worlds of the ray tracer. Each ray has its own time within the exposure: it is taken into the body's frame
-at that time and into the scene's, meets both, and the nearer is what it sees; its shadow is tested in both. So the blur of motion
-is exact, no world is ever rebuilt, and frames of different poses are traced in one launch.
+Bodies and scene are two worlds of the ray tracer. Each ray has its own time within the exposure: it is taken into each body's
+frame at that time and into the scene's, meets all, and the nearest is what it sees; its shadow is tested in all. So the blur of
+motion is exact, no world is ever rebuilt, and frames of different poses are traced in one launch. The kernel is unrolled over the
+bodies.
 
 Each of a ray's few shadow rays stands for all sources: what they would give without shadows is summed up, and counts if the one
 that is followed is seen, chosen in proportion to what it would give. Where nothing is in shadow there is next to no noise.
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import Rig, Target
+from recon.model.rig import MOST_CIRCLES, Rig, Target
 from scenes.handheld.mesh_parts import SLOTS
 from twin.optics.sampling import PairedPoints
 from twin.tracking.mesh_bank import Bank
@@ -51,7 +52,7 @@ class Lanes:
     samples: NDArray[np.uint32]  # (n,) rays
     set: NDArray[np.uint32]  # (n,) number of the set of sample points, one of its own for each pixel that is looked at
     first: NDArray[np.uint32]  # (n,) of the set's points that are the lane's
-    circle: NDArray[np.uint32]  # (n,) circle whose visible part is computed, or NO_CIRCLE
+    circle: NDArray[np.uint32]  # (n,) `circle_number` of the circle whose visible part is computed, or NO_CIRCLE
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,17 @@ class Light:
     plain: Floats  # the same without shadows
     disc: Floats  # rays towards the lane's circle, its outline filled, whatever stands before it
     seen: Floats  # of these, rays that reach it
-    white: Floats  # rays that end on the target's paper
+    white: Floats  # rays that end on the paper of the target that has the lane's circle, or of the probe's
     white_radiance: Floats  # sum over these
 
     def part(self, lanes: slice) -> "Light":
         """Values of some lanes."""
         return Light(*(getattr(self, name)[lanes] for name in Light.__dataclass_fields__))
+
+
+def circle_number(body: int, circle: int) -> int:
+    """Number that lanes have for a circle of a body, which is counted as in `Take.held`."""
+    return body * MOST_CIRCLES + circle
 
 
 def render(
@@ -83,16 +89,26 @@ def render(
 
     Parameters
     ----------
+    takes : of the same bodies, each
     most_samples : int
         Points of the largest set, a power of two.
     grid : BitGrid or None
-        Print on the target's face instead of the circles.
+        Print on the face of the probe's target instead of the circles.
+
+    Raises
+    ------
+    ValueError
+        If the takes have different bodies.
     """
+    names = list(takes[0].held)
+    if any(list(one.held) != names for one in takes):
+        raise ValueError(f"takes: expected the bodies {', '.join(names)} in each, found others")
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
     cameras = Rows.of(camera_columns(takes), take * 2 + camera)
-    path = _Path(bank, rig.target, rows, cameras, grid)
+    bodies = [_Body(k, name, rig.targets[name], rows, None if k else grid) for k, name in enumerate(names)]
+    path = _Path(bank, bodies, rows, cameras)
     key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
     u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
@@ -142,43 +158,126 @@ class _Source(NamedTuple):
     way: mi.Vector3f  # to a point of it
 
 
+class _Meeting(NamedTuple):
+    """Where a ray meets a held body first, if it does."""
+
+    valid: mi.Bool
+    distance: mi.Float  # mm, infinite where it meets none
+    normal: mi.Vector3f  # in the world
+    uv: mi.Point2f  # slot and albedo
+    place: mi.Vector3f  # in the bank
+    body: mi.UInt32  # number
+
+
+class _Body:
+    """A held body of the same takes; fetches constant parameters once."""
+
+    def __init__(self, number: int, name: str, target: Target, rows: Rows, grid: BitGrid | None) -> None:
+        self.number, self.target, self.grid = number, target, grid
+        self.target_from_world = Turn.of(rows, f"{name} target_from_world")
+        self.origin, self.shift = rows.vector(f"{name} origin"), rows.vector(f"{name} shift")
+        self.axis, self.angle = rows.vector(f"{name} axis"), rows.number(f"{name} angle")
+        self.body_at, self.present = rows.vector(f"{name} body_at"), rows.number(f"{name} present") > 0
+        self.face = Face.of(rows, name)
+
+    def _untwisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
+        """A direction of the world, turned back by the target's rotation since the middle of the exposure [Rodrigues]."""
+        s, c = dr.sincos(-self.angle * time)
+        return d * c + dr.cross(self.axis, d) * s + self.axis * (dr.dot(self.axis, d) * (1 - c))
+
+    def _twisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
+        return self._untwisted(d, -time)
+
+    def ray(self, ray: mi.Ray3f, time: mi.Float) -> mi.Ray3f:
+        """The ray in the target's frame at its time."""
+        from_origin = mi.Vector3f(ray.o) - self.origin - self.shift * time
+        start = self.target_from_world.rotate(self._untwisted(from_origin, time))
+        return mi.Ray3f(mi.Point3f(start), self.target_from_world.rotate(self._untwisted(ray.d, time)))
+
+    def banked(self, turned: mi.Ray3f) -> mi.Ray3f:
+        """A ray of the target's frame where the body's variant stands in the bank."""
+        return mi.Ray3f(turned.o + self.body_at, turned.d)
+
+    def on_face(self, turned: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Bool]:
+        """Where a ray of the target's frame passes the face's plane, and whether it comes from the front."""
+        distance = -turned.o.z / turned.d.z
+        place = mi.Vector3f(turned.o) + turned.d * distance
+        return place.x, place.y, self.present & (turned.d.z < 0) & (distance > 0)
+
+    def within_circle(self, x, y, circle) -> mi.Bool:
+        """Whether a place on the face lies in the lane's circle, its outline filled."""
+        cx, cy, own = mi.Float(0), mi.Float(0), mi.Bool(False)
+        for k, (there_x, there_y, _) in enumerate(circle_centres(self.target).tolist()):
+            this = circle == circle_number(self.number, k)
+            cx, cy, own = dr.select(this, there_x, cx), dr.select(this, there_y, cy), own | this
+        return own & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
+
+    def meet(self, bank: Bank, turned: mi.Ray3f, time: mi.Float, nearer: _Meeting | None) -> _Meeting:
+        """Where a ray of the target's frame meets the body, if no other was met nearer."""
+        ray = self.banked(turned)
+        if nearer is not None:
+            ray.maxt = nearer.distance
+        here = bank.bodies.ray_intersect(ray, mi.RayFlags.UV | mi.RayFlags.ShadingFrame, True, self.present)
+        normal = self._twisted(self.target_from_world.rotate_back(mi.Vector3f(here.sh_frame.n)), time)
+        met = _Meeting(here.is_valid(), here.t, normal, here.uv, mi.Vector3f(ray(here.t)), mi.UInt32(self.number))
+        if nearer is None:
+            return met
+        return _Meeting(
+            met.valid | nearer.valid, *(dr.select(met.valid, *both) for both in zip(met[1:], nearer[1:], strict=True))
+        )
+
+    def reflectance(self, x, y, texture) -> mi.Float:
+        """Of the face, at a place on it."""
+        covered = ring_cover(self.target, x, y, self.face.paint[3]) if self.grid is None else grid_cover(self.grid, x, y)
+        return self.face.reflectance(covered, texture, x, y)
+
+    def is_paper(self, reflectance) -> mi.Bool:
+        """Whether the face is white where it reflects so much."""
+        paper = self.face.paint[1]
+        return (reflectance > 0.8 * paper) & (reflectance < 1.25 * paper)
+
+
 class _Path:
     """Rays through the same takes, one after another; fetches constant parameters once."""
 
-    def __init__(self, bank: Bank, target: Target, rows: Rows, cameras: Rows, grid: BitGrid | None) -> None:
-        self.bank, self.target, self.rows, self.grid = bank, target, rows, grid
+    def __init__(self, bank: Bank, bodies: Sequence[_Body], rows: Rows, cameras: Rows) -> None:
+        self.bank, self.bodies, self.rows = bank, bodies, rows
         self.world_from_camera = Turn.of(cameras, "world_from_camera")
         self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
         self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
         self.pupil, self.focus, self.blur, self.vignetting, self.mid_u, self.mid_v, self.corner = cameras.all("lens")
         self.late = cameras.number("late")
-        self.target_from_world = Turn.of(rows, "target_from_world")
         self.scene_from_world = Turn.of(rows, "scene_from_world")
-        self.origin, self.shift = rows.vector("origin"), rows.vector("shift")
-        self.axis, self.angle = rows.vector("axis"), rows.number("angle")
-        self.body_at, self.present = rows.vector("body_at"), rows.number("present") > 0
         self.ambient, self.gradient = rows.number("ambient"), rows.vector("gradient")
         self.texture_shift = rows.vector("texture_shift")
-        self.face, self.lamps = Face.of(rows), rows.all("lamps")
+        self.lamps = rows.all("lamps")
         self.projector_from_world = Turn.of(rows, "projector_from_world")
         self.projector, self.projector_matrix = rows.all("projector"), rows.all("projector_matrix")
 
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
-        """Radiance of one ray, with shadows and without; whether it aims at the circle, reaches it, and ends on paper."""
+        """Radiance of one ray, with shadows and without; whether it aims at the circle, reaches it, and ends on its paper."""
         ray, cosine = self._ray(u, v, points)
         time = points.square().x - 0.5 + self.late  # not mirrored: a long blur wants as many times as there are rays
-        turned = self._body_ray(ray, time)
-        x, y, faces = self._on_face(turned)
-        aims = faces & self._within_circle(x, y, circle)
-        place, normal, surface, on_face, nothing = self._nearest(ray, turned, time, x, y)
+        turned = [body.ray(ray, time) for body in self.bodies]
+        crossed = [body.on_face(its) for body, its in zip(self.bodies, turned, strict=True)]
+        place, normal, surface, on_faces, nothing = self._nearest(ray, turned, time, crossed)
         light, plain = self._reflected(place, normal, -ray.d, surface, time, points)
         away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
         falls = (1 - self.vignetting * away) * cosine**4
         around = self.ambient * self._share_from(ray.d)
         radiance, plain = (dr.select(nothing, around, value) * falls for value in (light, plain))
-        paper = self.face.paint[1]
-        on_paper = on_face & (surface[0] > 0.8 * paper) & (surface[0] < 1.25 * paper)
-        return radiance, plain, aims, aims & on_face, on_paper
+        aims, reaches, on_paper = mi.Bool(False), mi.Bool(False), mi.Bool(False)
+        for body, (x, y, faces), on_face in zip(self.bodies, crossed, on_faces, strict=True):
+            towards = faces & body.within_circle(x, y, circle)
+            aims, reaches = aims | towards, reaches | (towards & on_face)
+            on_paper |= self._is_asked(body, circle) & on_face & body.is_paper(surface[0])
+        return radiance, plain, aims, reaches, on_paper
+
+    def _is_asked(self, body: _Body, circle) -> mi.Bool:
+        """Whether the lane's circle is one of the body's; a lane without a circle is the first body's."""
+        if len(self.bodies) == 1:
+            return mi.Bool(True)
+        return circle // MOST_CIRCLES == body.number if body.number else (circle < MOST_CIRCLES) | (circle == NO_CIRCLE)
 
     def _ray(self, u, v, points: PairedPoints) -> tuple[mi.Ray3f, mi.Float]:
         """Through a point of the pixel, spread by the lens, and a point of the pupil; and its cosine with the optical axis.
@@ -201,71 +300,44 @@ class _Path:
         start, way = self.world_from_camera.apply(start), self.world_from_camera.rotate(direction)
         return mi.Ray3f(mi.Point3f(start), way), dr.rsqrt(1 + x * x + y * y)
 
-    def _untwisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
-        """A direction of the world, turned back by the target's rotation since the middle of the exposure [Rodrigues]."""
-        s, c = dr.sincos(-self.angle * time)
-        return d * c + dr.cross(self.axis, d) * s + self.axis * (dr.dot(self.axis, d) * (1 - c))
-
-    def _twisted(self, d: mi.Vector3f, time: mi.Float) -> mi.Vector3f:
-        return self._untwisted(d, -time)
-
-    def _body_ray(self, ray: mi.Ray3f, time: mi.Float) -> mi.Ray3f:
-        """The ray in the target's frame at its time."""
-        from_origin = mi.Vector3f(ray.o) - self.origin - self.shift * time
-        start = self.target_from_world.rotate(self._untwisted(from_origin, time))
-        return mi.Ray3f(mi.Point3f(start), self.target_from_world.rotate(self._untwisted(ray.d, time)))
-
-    def _on_face(self, ray: mi.Ray3f) -> tuple[mi.Float, mi.Float, mi.Bool]:
-        """Where the ray passes the face's plane, and whether it comes from the front."""
-        distance = -ray.o.z / ray.d.z
-        place = mi.Vector3f(ray.o) + ray.d * distance
-        return place.x, place.y, self.present & (ray.d.z < 0) & (distance > 0)
-
-    def _within_circle(self, x, y, circle) -> mi.Bool:
-        cx, cy = mi.Float(0), mi.Float(0)
-        for number, (there_x, there_y, _) in enumerate(circle_centres(self.target).tolist()):
-            cx, cy = dr.select(circle == number, there_x, cx), dr.select(circle == number, there_y, cy)
-        return (circle != NO_CIRCLE) & ((x - cx) ** 2 + (y - cy) ** 2 < (self.target.outer_diameter_mm / 2) ** 2)
-
-    def _banked(self, ray: mi.Ray3f) -> mi.Ray3f:
-        return mi.Ray3f(ray.o + self.body_at, ray.d)
-
     def _scene_ray(self, ray: mi.Ray3f) -> mi.Ray3f:
         return mi.Ray3f(mi.Point3f(self.scene_from_world.apply(mi.Vector3f(ray.o))), self.scene_from_world.rotate(ray.d))
 
-    def _nearest(self, ray: mi.Ray3f, turned: mi.Ray3f, time, x, y) -> tuple:
-        """Intersection of a ray: place and normal in the world, surface, whether it is the target's face; or none."""
-        in_body, in_scene = self._banked(turned), self._scene_ray(ray)
+    def _nearest(self, ray: mi.Ray3f, turned: Sequence[mi.Ray3f], time, crossed: Sequence[tuple]) -> tuple:
+        """Intersection of a ray: place and normal in the world, surface, of each body whether it is its target's face; or none.
+
+        turned, crossed : the ray in each target's frame, and where it crosses the face's plane.
+        """
+        met = None
+        for body, its in zip(self.bodies, turned, strict=True):
+            met = body.meet(self.bank, its, time, met)
+        in_scene = self._scene_ray(ray)
+        in_scene.maxt = mi.Float(met.distance)  # infinite where all bodies are missed
         flags = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
-        body = self.bank.bodies.ray_intersect(in_body, flags, True, self.present)
-        in_scene.maxt = mi.Float(body.t)  # infinite where the body is missed
         scene = self.bank.scenes.ray_intersect(in_scene, flags, True, mi.Bool(True))
-        held = body.is_valid() & (body.t < scene.t)
-        nothing = ~body.is_valid() & ~scene.is_valid()
-        distance = dr.minimum(body.t, scene.t)
-        from_body = self._twisted(self.target_from_world.rotate_back(mi.Vector3f(body.sh_frame.n)), time)
+        held = met.valid & (met.distance < scene.t)
+        nothing = ~met.valid & ~scene.is_valid()
+        distance = dr.minimum(met.distance, scene.t)
         from_scene = self.scene_from_world.rotate_back(mi.Vector3f(scene.sh_frame.n))
-        normal = dr.select(held, from_body, from_scene)
+        normal = dr.select(held, met.normal, from_scene)
         normal = dr.select(dr.dot(normal, ray.d) > 0, -normal, normal)
         poster = scene.is_valid() & ~held & (scene.shape == self.bank.posters)
-        uv = dr.select(held, body.uv.x, dr.select(poster, float(POSTER), scene.uv.x))
-        albedo = dr.select(held, body.uv.y, dr.select(poster, 0, scene.uv.y))
+        uv = dr.select(held, met.uv.x, dr.select(poster, float(POSTER), scene.uv.x))
+        albedo = dr.select(held, met.uv.y, dr.select(poster, 0, scene.uv.y))
         slot = mi.UInt32(dr.clip(dr.select(nothing, 0, dr.floor(uv + 0.5)), 0, len(SLOTS) - 1))
-        on_face = held & (slot == TARGET)
+        on_faces = [held & (slot == TARGET) & (met.body == body.number) for body in self.bodies]
         row = self.rows.chosen("surfaces", slot, 6)
-        place = dr.select(held, mi.Vector3f(in_body(body.t)), mi.Vector3f(in_scene(scene.t))) + self.texture_shift
+        place = dr.select(held, met.place, mi.Vector3f(in_scene(scene.t))) + self.texture_shift
         seed = mi.UInt32(slot) * 77 + mi.UInt32(self.texture_shift.x * 100 + 1e6)
         texture = relief(row, place, seed)
-        printed = self.face.reflectance(self._covered(x, y), texture, x, y)
-        reflectance = dr.select(on_face, printed, dr.select(albedo > 0, albedo, textured(row, texture)))
-        sheet = poster_reflectance(self.target, reflectance, scene.uv.x, scene.uv.y, mi.UInt32(self.texture_shift.y * 100 + 1e6))
+        reflectance = dr.select(albedo > 0, albedo, textured(row, texture))
+        for body, (x, y, _), on_face in zip(self.bodies, crossed, on_faces, strict=True):
+            reflectance = dr.select(on_face, body.reflectance(x, y, texture), reflectance)
+        sheet = poster_reflectance(
+            self.bodies[0].target, reflectance, scene.uv.x, scene.uv.y, mi.UInt32(self.texture_shift.y * 100 + 1e6)
+        )
         reflectance = dr.select(poster, sheet, reflectance)
-        return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_face, nothing
-
-    def _covered(self, x, y) -> mi.Float:
-        if self.grid is not None:
-            return grid_cover(self.grid, x, y)
-        return ring_cover(self.target, x, y, self.face.paint[3])
+        return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_faces, nothing
 
     def _share_from(self, direction: mi.Vector3f) -> mi.Float:
         """Light that comes from a direction, over the mean of all."""
@@ -348,7 +420,11 @@ class _Path:
         """Whether anything stands in a shadow ray's way."""
         reach = dr.norm(way)
         ray = mi.Ray3f(mi.Point3f(place), way / reach)
-        in_body, in_scene = self._banked(self._body_ray(ray, time)), self._scene_ray(ray)
-        in_body.maxt, in_scene.maxt = mi.Float(reach), mi.Float(reach)
-        by_scene = self.bank.scenes.ray_test(in_scene, active)
-        return by_scene | self.bank.bodies.ray_test(in_body, active & self.present & ~by_scene)
+        in_scene = self._scene_ray(ray)
+        in_scene.maxt = mi.Float(reach)
+        blocked = self.bank.scenes.ray_test(in_scene, active)
+        for body in self.bodies:
+            in_body = body.banked(body.ray(ray, time))
+            in_body.maxt = mi.Float(reach)
+            blocked |= self.bank.bodies.ray_test(in_body, active & body.present & ~blocked)
+        return blocked

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.rig import Rig
-from twin.tracking.samples import Take
+from twin.tracking.samples import Held, Take
 
 Array = NDArray[np.float64]
 
@@ -85,21 +85,13 @@ class Turn:
 def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Array) -> dict[str, Array]:
     """Columns of a take's parameters : (takes, ...); variants stand at body_at, scene_at : (variants, 3) mm in their banks."""
     lights = [take.lighting for take in takes]
-    into_target = np.array([rigid.invert(take.motion.world_from_target) for take in takes])
     into_scene = np.array([take.scene_from_world for take in takes])
     into_scene[:, :3, 3] += scene_at[[take.surroundings for take in takes]]
-    angle = np.array([np.linalg.norm(take.motion.turn_rad) for take in takes])
-    axis = np.array([take.motion.turn_rad for take in takes]) / np.maximum(angle, 1e-12)[:, None]
     projector = rig.projector.optics.camera()
     m = projector.matrix
+    bodies = [held_columns(name, [take.held[name] for take in takes], body_at) for name in takes[0].held]
     return {
-        "present": np.array([float(take.present) for take in takes]),
-        "target_from_world": into_target,
-        "origin": np.array([take.motion.world_from_target[:3, 3] for take in takes]),
-        "shift": np.array([take.motion.shift_mm for take in takes]),
-        "axis": axis,
-        "angle": angle,
-        "body_at": body_at[[take.body for take in takes]],
+        **{name: column for columns in bodies for name, column in columns.items()},
         "scene_from_world": into_scene,
         "lamps": np.array([light.lamps for light in lights]),
         "ambient": np.array([light.ambient for light in lights]),
@@ -109,10 +101,25 @@ def take_columns(takes: Sequence[Take], rig: Rig, body_at: Array, scene_at: Arra
         "projector_matrix": np.repeat([[m[0, 0], m[1, 1], m[0, 2], m[1, 2], *projector.size]], len(takes), axis=0),
         "surfaces": np.array([take.surfaces for take in takes]),
         "texture_shift": np.array([take.texture_shift for take in takes]),
-        "print": np.array([[t.face.ink, t.face.paper, t.face.unevenness, max(t.face.softness_mm, 0.01)] for t in takes]),
-        "scratches": np.array([take.face.scratches for take in takes]),
-        "spots": np.array([take.face.spots for take in takes]),
     }
+
+
+def held_columns(name: str, held: Sequence[Held], body_at: Array) -> dict[str, Array]:
+    """Columns of one body's parameters : (takes, ...), each named after the body and itself."""
+    angle = np.array([np.linalg.norm(one.motion.turn_rad) for one in held])
+    columns = {
+        "present": np.array([float(one.present) for one in held]),
+        "target_from_world": np.array([rigid.invert(one.motion.world_from_target) for one in held]),
+        "origin": np.array([one.motion.world_from_target[:3, 3] for one in held]),
+        "shift": np.array([one.motion.shift_mm for one in held]),
+        "axis": np.array([one.motion.turn_rad for one in held]) / np.maximum(angle, 1e-12)[:, None],
+        "angle": angle,
+        "body_at": body_at[[one.body for one in held]],
+        "print": np.array([[o.face.ink, o.face.paper, o.face.unevenness, max(o.face.softness_mm, 0.01)] for o in held]),
+        "scratches": np.array([one.face.scratches for one in held]),
+        "spots": np.array([one.face.spots for one in held]),
+    }
+    return {f"{name} {column}": values for column, values in columns.items()}
 
 
 def camera_columns(takes: Sequence[Take]) -> dict[str, Array]:

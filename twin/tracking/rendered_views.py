@@ -1,9 +1,9 @@
 """From a sample's parameters to camera images and their ground truth; several takes in one launch."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -11,21 +11,22 @@ from numpy.typing import NDArray
 
 from recon.geometry import rigid
 from recon.model import circle_layout
-from recon.model.rig import CameraDevice, Rig, Target
+from recon.model.rig import MOST_CIRCLES, PROBE, CameraDevice, Rig, Target
 from recon.threads import mapped
 from twin.sensor import Exposure, digitise, number_per_electron, read_out
 from twin.shooting import FilmQuality, Quality
 from twin.tracking.film_pictures import FilmPicture, film_picture, most_rays, visible_shares
 from twin.tracking.mesh_bank import Bank
-from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, render
+from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, circle_number, render
 from twin.tracking.pixel_selection import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
 from twin.tracking.samples import Take
 from twin.tracking.surface_prints import BitGrid
 from twin.tracking.target_truth import ViewTruth, board_corners, inside_share, view_truth
 
 Grey = NDArray[np.uint8]
+Views = tuple[ViewTruth, ViewTruth]
 
-AROUND = 24  # px of a sketch's window about the target's board
+AROUND = 24  # px of a sketch's window about the targets' boards
 DARKEST = 0.15  # of the light that falls on a face at right angles: what an exposure is set by is never less
 
 
@@ -34,14 +35,20 @@ class Frames:
     """Images of both cameras, with the truth of each view."""
 
     views: tuple[Grey, Grey]  # (240, 320), or (h, w) full frames
-    truth: tuple[ViewTruth, ViewTruth]
+    truth: Views  # of the probe's target
+    others: Mapping[str, Views] = field(default_factory=dict, kw_only=True)  # of further bodies' targets, by name
+
+    @property
+    def bodies(self) -> dict[str, Views]:
+        """Truth of all bodies by name, the probe's first."""
+        return {PROBE: self.truth, **self.others}
 
 
 @dataclass(frozen=True)
 class Sample(Frames):
     """One sample's images: of the views, too."""
 
-    patches: Grey  # (2, n, 120, 120)
+    patches: Grey  # (2, n, 120, 120) of all bodies' circles
 
 
 class Shot(NamedTuple):
@@ -49,7 +56,7 @@ class Shot(NamedTuple):
 
     take: Take
     camera: int  # 0 or 1
-    truth: ViewTruth
+    truth: Mapping[str, ViewTruth]  # by bodies' names
 
     @property
     def device(self) -> CameraDevice:
@@ -60,6 +67,15 @@ class Shot(NamedTuple):
     def late(self) -> float:
         """Share of the exposure by which it exposes later."""
         return self.take.late[self.camera]
+
+
+def shots_of(takes: Sequence[Take], targets: Mapping[str, Target]) -> list[Shot]:
+    """Shots of both cameras of each take, with the truth that needs no rendering."""
+    return [
+        Shot(take, k, {name: view_truth(held, device, take.late[k], targets[name]) for name, held in take.held.items()})
+        for take in takes
+        for k, device in enumerate(take.cameras)
+    ]
 
 
 def render_views(bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int) -> list[Sample]:
@@ -79,35 +95,45 @@ def render_full(
 def render_sketches(
     bank: Bank, rig: Rig, takes: Sequence[Take], quality: Quality, seed: int, grid: BitGrid | None = None
 ) -> list[Sample]:
-    """Full camera images of which the view and a window about the target are rendered; see `pictures.Sketch`."""
+    """Full camera images of which the view and a window about the targets are rendered; see `pictures.Sketch`."""
     pictures = [
-        [_sketch(take, *seen, rig.target, quality) for seen in zip(take.cameras, take.late, strict=True)] for take in takes
+        [_sketch(take, *seen, rig.targets, quality) for seen in zip(take.cameras, take.late, strict=True)] for take in takes
     ]
     return _rendered(bank, rig, takes, pictures, quality, seed, grid)
 
 
 def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQuality, seed: int) -> list[Frames]:
     """Full camera images of which some pixels are rendered and the others interpolated; see `film_pictures`."""
-    shots = [
-        Shot(take, camera, view_truth(take, device, take.late[camera], rig.target))
-        for take in takes
-        for camera, device in enumerate(take.cameras)
-    ]
-    pictures = [film_picture(shot.take, shot.device, shot.late, rig.target, shot.truth, quality) for shot in shots]
+    targets = rig.targets
+    shots = shots_of(takes, targets)
+    pictures = [film_picture(shot.take, shot.device, shot.late, targets, shot.truth, quality) for shot in shots]
     blocks = [picture.lanes(k // 2, shot.camera) for k, (picture, shot) in enumerate(zip(pictures, shots, strict=True))]
     light = render(bank, rig, takes, joined(blocks), most_rays(quality), seed)
     starts = np.cumsum([0, *(len(block.u) for block in blocks)])
     parts = [light.part(slice(a, b)) for a, b in pairwise(starts)]
 
-    def finished(shot: Shot, picture: FilmPicture, block: Lanes, part: Light) -> tuple[Grey, ViewTruth]:
-        shares = visible_shares(block, part, len(shot.truth.ellipses)) * inside_share(
-            shot.truth.ellipses, shot.device.optics.size
-        )
-        truth = replace(shot.truth, visible=shares, white_dn=_white(part, [slice(None)], shot.take, shot.device, rig))
+    def finished(shot: Shot, picture: FilmPicture, block: Lanes, part: Light) -> tuple[Grey, dict[str, ViewTruth]]:
+        shares, truth = visible_shares(block, part, len(shot.truth) * MOST_CIRCLES), {}
+        for number, (name, known) in enumerate(shot.truth.items()):
+            first = circle_number(number, 0)
+            visible = shares[first : first + len(known.ellipses)] * inside_share(known.ellipses, shot.device.optics.size)
+            its = block.circle // MOST_CIRCLES == number
+            white = _white(part, [its if number else its | (block.circle == NO_CIRCLE)], shot.take, shot.device, rig)
+            truth[name] = replace(known, visible=visible, white_dn=white)
         return _exposed(picture.radiance(part), shot, rig), truth
 
     both = list(mapped(finished, shots, pictures, blocks, parts))
-    return [Frames((first[0], second[0]), (first[1], second[1])) for first, second in zip(both[::2], both[1::2], strict=True)]
+    result = []
+    for (first, known), (second, its) in zip(both[::2], both[1::2], strict=True):
+        truth, others = _paired(known, its)
+        result.append(Frames((first, second), truth, others=others))
+    return result
+
+
+def _paired(first: Mapping[str, ViewTruth], second: Mapping[str, ViewTruth]) -> tuple[Views, dict[str, Views]]:
+    """Truth of both views, of the probe's target and of further bodies'."""
+    both = {name: (first[name], second[name]) for name in first}
+    return both.pop(PROBE), both
 
 
 def _exposed(radiance: NDArray[np.float32], shot: Shot, rig: Rig) -> Grey:
@@ -117,13 +143,12 @@ def _exposed(radiance: NDArray[np.float32], shot: Shot, rig: Rig) -> Grey:
     return _read(electrons, slice(None), shot.device, shot.take, rng).reshape(radiance.shape)
 
 
-def _sketch(take: Take, device: CameraDevice, late: float, target: Target, quality: Quality) -> Sketch:
-    size = device.optics.size
+def _sketch(take: Take, device: CameraDevice, late: float, targets: Mapping[str, Target], quality: Quality) -> Sketch:
+    size, camera = device.optics.size, device.optics.camera()
     first, extent = (0, 0), (1, 1)
-    if take.present:
-        corners = board_corners(target)
-        motion, camera = take.motion.later(late), device.optics.camera()
-        places = np.concatenate([camera.project(rigid.apply(motion.at(t), corners)) for t in (-0.5, 0.5)])
+    ways = [(held.motion.later(late), board_corners(targets[name])) for name, held in take.held.items() if held.present]
+    if ways:
+        places = np.concatenate([camera.project(rigid.apply(way.at(t), corners)) for way, corners in ways for t in (-0.5, 0.5)])
         if np.isfinite(places).all():
             low = np.clip(np.floor(places.min(axis=0)) - AROUND, 0, np.array(size) - 2).astype(int)
             high = np.clip(np.ceil(places.max(axis=0)) + AROUND, low + 1, np.array(size) - 1).astype(int)
@@ -141,19 +166,20 @@ def _rendered(
     grid: BitGrid | None = None,
 ) -> list[Sample]:
     """One launch for all images and patches of all takes; then the sensors, image by image."""
-    count = circle_layout.count(rig.target)
-    truths = [[view_truth(take, *seen, rig.target) for seen in zip(take.cameras, take.late, strict=True)] for take in takes]
+    targets = rig.targets
+    counts = [circle_layout.count(targets[name]) for name in takes[0].held]
+    count = sum(counts)
+    shots = shots_of(takes, targets)
     blocks, origins = [], []
-    for i, take in enumerate(takes):
-        for camera, device in enumerate(take.cameras):
-            first = _patch_origins(take, camera, truths[i][camera])
-            circles = range(count) if take.present else [NO_CIRCLE] * count
-            patches = [
-                Window(device.optics.size, tuple(first[c].tolist()), (PATCH, PATCH), quality.patch, c, circle)
-                for c, circle in enumerate(circles)
-            ]
-            blocks += [picture.lanes(i, camera) for picture in (pictures[i][camera], *patches)]
-            origins.append(first)
+    for shot, picture in zip(shots, (one for both in pictures for one in both), strict=True):
+        firsts = [_patch_origins(shot, number, truth) for number, truth in enumerate(shot.truth.values())]
+        patches = [
+            Window(shot.device.optics.size, tuple(first.tolist()), (PATCH, PATCH), quality.patch, circle, circle)
+            for number, those in enumerate(firsts)
+            for circle, first in enumerate(those, circle_number(number, 0))
+        ]
+        blocks += [one.lanes(len(origins) // 2, shot.camera) for one in (picture, *patches)]
+        origins.append(firsts)
     light = render(bank, rig, takes, joined(blocks), max(4 * quality.view, quality.patch, quality.window), seed, grid)
     starts = np.cumsum([0, *(len(block.u) for block in blocks)])
     pieces = [slice(a, b) for a, b in pairwise(starts)]
@@ -162,28 +188,31 @@ def _rendered(
     for i, take in enumerate(takes):
         views, patches, told = [], [], []
         for camera, device in enumerate(take.cameras):
+            shot = shots[2 * i + camera]
             at = (1 + count) * (2 * i + camera)  # an image and a patch each circle
             views.append(pictures[i][camera].image(numbers[at]))
             patches.append(np.stack(numbers[at + 1 : at + 1 + count]).reshape(count, PATCH, PATCH))
-            seen = pieces[at + 1 : at + 1 + count]
-            told.append(
-                replace(
-                    truths[i][camera],
-                    visible=_visible(light, seen) * inside_share(truths[i][camera].ellipses, device.optics.size),
-                    white_dn=_white(light, seen, take, device, rig),
-                    patch_origins=origins[2 * i + camera],
+            seen, known = iter(pieces[at + 1 : at + 1 + count]), {}
+            for (name, truth), those in zip(shot.truth.items(), origins[2 * i + camera], strict=True):
+                its = list(islice(seen, len(those)))
+                known[name] = replace(
+                    truth,
+                    visible=_visible(light, its) * inside_share(truth.ellipses, device.optics.size),
+                    white_dn=_white(light, its, take, device, rig),
+                    patch_origins=those,
                 )
-            )
-        result.append(Sample((views[0], views[1]), (told[0], told[1]), np.stack(patches)))
+            told.append(known)
+        truth, others = _paired(*told)
+        result.append(Sample((views[0], views[1]), truth, np.stack(patches), others=others))
     return result
 
 
-def _patch_origins(take: Take, camera: int, truth: ViewTruth) -> NDArray[np.int64]:
+def _patch_origins(shot: Shot, number: int, truth: ViewTruth) -> NDArray[np.int64]:
     """Where patches begin : (n, 2) px, about the circles as a detector that is a pixel off would place them; or anywhere."""
-    rng = np.random.default_rng([take.noise_seed, camera])
-    size = np.array(take.cameras[camera].optics.size)
+    rng = np.random.default_rng([shot.take.noise_seed, shot.camera, *([1 + number] if number else [])])
+    size = np.array(shot.device.optics.size)
     coarse = np.rint(np.nan_to_num(truth.centres) / (size / VIEW) + rng.uniform(-1, 1, truth.centres.shape)) * (size / VIEW)
-    if not take.present or not np.isfinite(truth.centres).all():
+    if not np.isfinite(truth.centres).all():
         coarse = rng.uniform([0, 0], size, truth.centres.shape)
     return np.rint(np.clip(coarse, 0, size - 1)).astype(int) - HALF
 

@@ -1,6 +1,7 @@
 """One tracking sample's parameters: cameras, pose and motion, lights, materials, exposure; from (seed, k) alone."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model import circle_layout
-from recon.model.rig import CameraDevice, Lens, Rig, Sensor
+from recon.model.rig import PROBE, CameraDevice, Lens, Rig, Sensor
 from scenes.handheld.mesh_parts import SLOTS
 from twin.tracking.sampling_ranges import CameraRanges, DataRanges, LightRanges, PoseRanges, TargetRanges
 
@@ -83,8 +84,18 @@ class Print:
 
 
 @dataclass(frozen=True)
+class Held:
+    """A body that carries a target: how it moves, which variant it is, and its print."""
+
+    motion: Motion
+    body: int  # number of the variant in the bank
+    face: Print
+    present: bool = True
+
+
+@dataclass(frozen=True)
 class Take:
-    """All that makes one sample."""
+    """All that makes one sample: the probe, further bodies if there are any, what surrounds them, light and exposure."""
 
     k: int
     cameras: tuple[CameraDevice, CameraDevice]
@@ -101,6 +112,12 @@ class Take:
     gain: float
     noise_seed: int
     late: tuple[float, float] = (0.0, 0.0)  # of each camera's exposure, in exposures
+    others: Mapping[str, Held] = field(default_factory=dict)  # bodies besides the probe, by their names in `Rig.bodies`
+
+    @property
+    def held(self) -> dict[str, Held]:
+        """All bodies by name, the probe first."""
+        return {PROBE: Held(self.motion, self.body, self.face, self.present), **self.others}
 
 
 def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
@@ -117,7 +134,7 @@ def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
         motion=motion,
         body=int(rng.integers(ranges.variants)),
         surroundings=int(rng.integers(ranges.variants)),
-        scene_from_world=_scene_from_world(pose, rng),
+        scene_from_world=scene_behind(pose[:3, 3], rng),
         lighting=_lighting(ranges.light, pose, rng),
         surfaces=_surfaces(rng),
         texture_shift=rng.uniform(-500, 500, 3),
@@ -239,13 +256,13 @@ def _motion(ranges: PoseRanges, pose: Array, camera: Camera, rng: np.random.Gene
     return Motion(pose, direction * path, turn)
 
 
-def _scene_from_world(pose: Array, rng: np.random.Generator) -> Array:
-    """The table's top lies behind the target, seen from above or from the side by up to 50 degrees."""
+def scene_behind(place: Array, rng: np.random.Generator) -> Array:
+    """`scene_from_world`, its table's top behind a place : (3,) mm, seen from above or from the side by up to 50 degrees."""
     up = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)])
     lean = Rotation.from_rotvec(np.deg2rad(50) * rng.random() ** 2 * _around(rng))
     world_from_scene = rigid.transform((lean * Rotation.from_rotvec([np.pi, 0, 0]) * up).as_matrix(), np.zeros(3))
-    behind = pose[2, 3] + rng.uniform(60, 330)
-    world_from_scene[:3, 3] = [pose[0, 3] + rng.normal(0, 60), pose[1, 3] + rng.normal(0, 60), behind]
+    behind = place[2] + rng.uniform(60, 330)
+    world_from_scene[:3, 3] = [place[0] + rng.normal(0, 60), place[1] + rng.normal(0, 60), behind]
     return rigid.invert(world_from_scene)
 
 

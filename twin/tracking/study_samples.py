@@ -5,13 +5,16 @@ Unlike a data set's, these leave nothing to chance but pose, body and surroundin
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import Rig
-from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Lighting, Motion, Print, Take, draw, facing
+from recon.model.rig import PROBE, Rig, Target
+from twin.tracking.mesh_bank import Bank, all_uncovered
+from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Held, Lighting, Motion, Print, Take, draw, facing, scene_behind
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import board_corners
 from twin.working_range import working_range
@@ -22,6 +25,9 @@ HALF_MM = (125.0, 100.0)  # half the breadth and the height of the paper's volum
 TILT_DEG = 45.0  # most, of the target's normal from the way to the cameras
 MARGIN_PX = 12.0  # of the board from the images' borders
 TRIES = 200
+BODIES_TRIES, PLACE_TRIES = 300, 20  # of poses of several bodies, and of each beside those before
+BODIES_STREAM = 1  # of random numbers, apart from those of a single target
+WHITE_DN, BLUR_PX = (8.0, 180.0), (0.0, 12.0)  # of several bodies, least and most
 GAIN = 1.0
 CLEAN = Print(0.04, 0.8, 0.01, 0.03, np.zeros((SCRATCHES, 6)), np.zeros((SPOTS, 4)))  # a print without flaws
 TURN_SHARE = 0.3  # of the path in the image, what the target's turn adds on the way
@@ -31,12 +37,8 @@ def study_take(rig: Rig, ranges: DataRanges, seed: int, k: int, white_dn: float,
     """Take k of a study: the whole board within both views, its white at `white_dn` of 255, its middle moved by `blur_px`."""
     rng = np.random.default_rng([seed, k])
     drawn = draw(ranges, rig, seed, k)
-    pose = _pose(rig, rng)
-    path = blur_px * pose[2, 3] / rig.cam1.optics.focal_px[0]
-    angle = rng.uniform(0, 2 * np.pi)
-    axis = rng.standard_normal(3)
-    turn = axis / np.linalg.norm(axis) * TURN_SHARE * path / 30
-    motion = Motion(pose, path * np.array([np.cos(angle), np.sin(angle), 0]), turn)
+    pose = _pose(rig, rig.target, rng)
+    motion = _moving(rig, pose, blur_px, rng)
     scene = drawn.scene_from_world @ rigid.transform(np.eye(3), drawn.motion.world_from_target[:3, 3] - pose[:3, 3])
     return replace(
         drawn,
@@ -51,11 +53,77 @@ def study_take(rig: Rig, ranges: DataRanges, seed: int, k: int, white_dn: float,
     )
 
 
-def _pose(rig: Rig, rng: np.random.Generator) -> Array:
-    """Evenly over the working volume, and over the solid angle of tilts."""
+def bodies_take(
+    bank: Bank,
+    rig: Rig,
+    ranges: DataRanges,
+    seed: int,
+    k: int,
+    white_dn: tuple[float, float] = WHITE_DN,
+    blur_px: tuple[float, float] = BLUR_PX,
+) -> Take:
+    """Take k of a study of several bodies: all boards within both views, no circle covered; each body moves by itself.
+
+    bank : of `build_bodies`
+    white_dn, blur_px : least and most; the white log-uniform, the blur of each body's middle uniform
+
+    Raises
+    ------
+    InputError
+        If the boards don't find room beside each other.
+    """
+    rng = np.random.default_rng([seed, k, BODIES_STREAM])
+    white = float(np.exp(rng.uniform(*np.log(white_dn))))
+    drawn = replace(draw(ranges, rig, seed, k), cameras=(rig.cam1, rig.cam2), present=True, face=CLEAN, white_dn=white, gain=GAIN)
+    centres = np.array([device.optics.camera().centre for device in drawn.cameras])
+    for _ in range(BODIES_TRIES):
+        motions = _apart(rig, blur_px, rng)
+        if motions is None:
+            continue
+        variants = rng.integers(ranges.variants, size=len(motions)) + ranges.variants * np.arange(len(motions))
+        held = {name: Held(motion, int(n), CLEAN) for (name, motion), n in zip(motions.items(), variants, strict=True)}
+        poses = np.array([one.motion.world_from_target for one in held.values()])
+        probe = held.pop(PROBE)
+        scene = scene_behind(np.append(poses[:, :2, 3].mean(axis=0), poses[:, 2, 3].max()), rng)
+        take = replace(drawn, motion=probe.motion, body=probe.body, others=held, scene_from_world=scene)
+        if all_uncovered(bank, take, rig.targets, centres):
+            return replace(take, lighting=lit_from_the_front(poses[0], rng))
+    raise InputError(f"rig: expected both views to have room for the boards of {', '.join(rig.targets)}, found none")
+
+
+def _apart(rig: Rig, blur_px: tuple[float, float], rng: np.random.Generator) -> dict[str, Motion] | None:
+    """Motions of all bodies, whose boards keep apart in both views over the exposure; None if one finds no room."""
+    motions, taken = dict[str, Motion](), list[tuple[Array, ...]]()
+    views = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    for name, target in rig.targets.items():
+        corners = board_corners(target)
+        for _ in range(PLACE_TRIES):
+            motion = _moving(rig, _pose(rig, target, rng), rng.uniform(*blur_px), rng)
+            ways = [np.concatenate([view.project(rigid.apply(motion.at(t), corners)) for t in (-0.5, 0.5)]) for view in views]
+            hulls = tuple(cv2.convexHull(np.float32(way)) for way in ways)
+            if not any(cv2.intersectConvexConvex(a, b)[0] > 0 for those in taken for a, b in zip(those, hulls, strict=True)):
+                taken.append(hulls)
+                motions[name] = motion
+                break
+        else:
+            return None
+    return motions
+
+
+def _moving(rig: Rig, pose: Array, blur_px: float, rng: np.random.Generator) -> Motion:
+    """Over a path in the image, in any direction, with a turn about any axis."""
+    path = blur_px * pose[2, 3] / rig.cam1.optics.focal_px[0]
+    angle = rng.uniform(0, 2 * np.pi)
+    axis = rng.standard_normal(3)
+    turn = axis / np.linalg.norm(axis) * TURN_SHARE * path / 30
+    return Motion(pose, path * np.array([np.cos(angle), np.sin(angle), 0]), turn)
+
+
+def _pose(rig: Rig, target: Target, rng: np.random.Generator) -> Array:
+    """Of a target, evenly over the working volume, and over the solid angle of tilts."""
     views = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
     eyes = (views[0].centre + views[1].centre) / 2
-    middle_target = circle_centres(rig.target)[1:].sum(axis=0) / 2
+    middle_target = circle_centres(target)[1:].sum(axis=0) / 2
     where = working_range(rig)
     half, (near, far) = where.breadth * np.array(HALF_MM), where.depths_mm
     for _ in range(TRIES):
@@ -63,7 +131,7 @@ def _pose(rig: Rig, rng: np.random.Generator) -> Array:
         middle[:2] += [eyes[0] + where.aside_mm[0], where.aside_mm[1]]
         pose = rigid.transform(facing(eyes - middle, TILT_DEG, rng), np.zeros(3))
         pose[:3, 3] = middle - pose[:3, :3] @ middle_target
-        corners = [view.project(rigid.apply(pose, board_corners(rig.target))) for view in views]
+        corners = [view.project(rigid.apply(pose, board_corners(target))) for view in views]
         if all(_within(each, view.size) for each, view in zip(corners, views, strict=True)):
             return pose
     raise ValueError("rig: expected cameras that both see the working volume")

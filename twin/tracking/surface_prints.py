@@ -56,9 +56,9 @@ class Face:
     spots: list[mi.Float]
 
     @classmethod
-    def of(cls, rows: Rows) -> "Face":
-        """Fetch it."""
-        return cls(rows.all("print"), rows.all("scratches"), rows.all("spots"))
+    def of(cls, rows: Rows, name: str) -> "Face":
+        """Fetch that of a body."""
+        return cls(*(rows.all(f"{name} {column}") for column in ("print", "scratches", "spots")))
 
     def reflectance(self, covered: mi.Float, relief: mi.Float, x: mi.Float, y: mi.Float) -> mi.Float:
         """Ink coverage at x, y in mm: uneven, scratched and spotted."""

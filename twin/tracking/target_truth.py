@@ -10,7 +10,7 @@ from recon.geometry.camera import Camera
 from recon.model import circle_layout
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import CameraDevice, Target
-from twin.tracking.samples import Motion, Take
+from twin.tracking.samples import Held, Motion, Take
 
 Array = NDArray[np.float64]
 
@@ -31,14 +31,14 @@ class ViewTruth:
     white_dn: float = float("nan")  # brightness of the target's white, without noise
 
 
-def view_truth(take: Take, device: CameraDevice, late: float, target: Target) -> ViewTruth:
-    """Ground truth of a take's target in one camera, which exposes later by a share of the exposure."""
+def view_truth(held: Held | Take, device: CameraDevice, late: float, target: Target) -> ViewTruth:
+    """Ground truth of a body's target, or of a take's own, in one camera, which exposes later by a share of the exposure."""
     camera, model = device.optics.camera(), circle_centres(target)
     visible, origins = np.zeros(len(model)), np.zeros((len(model), 2), int)
-    if not take.present:
+    if not held.present:
         numbers, inside = np.full((len(model), 5), np.nan), np.zeros(len(model), bool)
         return ViewTruth(camera, numbers[:, :2], numbers, inside, numbers[:, 0], visible, origins)
-    motion = take.motion.later(late)
+    motion = held.motion.later(late)
     pose = motion.world_from_target
     rims = camera.project(rigid.apply(pose, outline(model, target.outer_diameter_mm / 2)))
     low, high = rims.min(axis=1), rims.max(axis=1)

@@ -10,11 +10,12 @@ from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
 from recon.geometry.rigid import difference
 from recon.tracking import views
-from tests.twin.tracking.takes import facing, plain_take, ranges, rig
+from tests.twin.tracking.takes import facing, plain_take, ranges, rig, rig_of_three
 from twin.experiments import rivals, tracking_reach
 from twin.experiments.detection_rates import percent, score
 from twin.experiments.experiment_setup import Setup
 from twin.experiments.pose_accuracy import centre_limit, pose_errors
+from twin.experiments.tracking_frames import several
 from twin.tracking.target_truth import view_truth
 
 RIG = rig()
@@ -98,3 +99,17 @@ def test_drawn_rigs_of_any_resolution_are_tracked(monkeypatch):
     monkeypatch.setattr(tracking_reach, "VARIANTS", 2)  # of bodies, which take as long as the frames
     setup = Setup(RIG, {}, frames=ranges(variants=2))
     assert tracking_reach.drawn_rigs(setup, 4, 1_400_000) == {"pairs": 4, "found_percent": 100.0, "wrong": 0}
+
+
+@pytest.mark.slow
+def test_several_bodies_are_rendered_as_drawn():
+    """Pair k is the same alone and among others; both views see all circles whole, about as bright as asked."""
+    setup = Setup(rig_of_three(), frames=ranges())
+    first = [frames for _, frames in several(setup, 4, 2, (50.0, 50.0), (0.0, 6.0))]
+    take, again = next(several(setup, 4, 1, (50.0, 50.0), (0.0, 6.0)))
+    assert list(again.bodies) == list(take.held) == ["probe", "needle", "patient"]
+    for view, same in zip(first[0].views, again.views, strict=True):
+        assert (view == same).all()
+    for both in (both for frames in first for both in frames.bodies.values()):
+        for truth in both:
+            assert truth.visible.min() > 0.99 and truth.inside.all() and 20 < truth.white_dn < 90

@@ -4,10 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 import yaml
 
 from recon.geometry import rigid
-from recon.model.rig import Rig
+from recon.model import circle_layout
+from recon.model.rig import Rig, Target
+from scenes.handheld import lofts
+from scenes.handheld.mesh_parts import Part
 from twin.tracking.samples import LAMPS, Lighting, Motion, Print, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 
@@ -51,3 +55,18 @@ def plain_take(pose: np.ndarray, *, shift_mm=(0, 0, 0), turn_rad=(0, 0, 0), k: i
         white_dn=white_dn,
         gain=1.0,
     )
+
+
+def rig_of_three() -> Rig:
+    """The rig with a needle and a patient beside the probe."""
+    bodies = {name: yaml.safe_load((CONF / f"target/{name}.yaml").read_text()) for name in ("needle", "patient")}
+    return Rig(**{**yaml.safe_load((CONF / "rig/meza2021.yaml").read_text()), "bodies": bodies})
+
+
+def bare_board(target: Target) -> list[Part]:
+    """The target's board, 3 mm thick and nothing else."""
+    half, middle = np.array(target.board_mm) / 2, circle_layout.middle(target)[:2]
+    corners = np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
+    front = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    solid = lofts.box([*target.board_mm, 2.95], [*middle, -1.525])
+    return [Part("target", front, False), Part("board", solid, False)]

@@ -11,6 +11,7 @@ from recon.board_detection.discs import measure
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
 from recon.model.circle_layout import circle_centres
+from recon.model.rig import PROBE
 from scenes.handheld.surroundings import surroundings
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.optics.sampling import sobol_pair
@@ -162,7 +163,7 @@ def test_paper_under_a_large_lamp_has_no_lattice_in_a_film(bank):
     lamps[0] = [*(pose[:3, 3] + pose[:3, :3] @ [100, 200, 700]), 80, 700.0**2]
     take = replace(take, lighting=replace(take.lighting, lamps=lamps, ambient=0.1))
     quality = FilmQuality(view=MOST // TILE**2)
-    picture = film_picture(take, take.cameras[0], 0.0, RIG.target, truth, quality)
+    picture = film_picture(take, take.cameras[0], 0.0, RIG.targets, {PROBE: truth}, quality)
     image = picture.radiance(render(bank, RIG, [take], picture.lanes(0, 0), most_rays(quality), 1))
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     a, b = (truth.centres[k] - truth.centres[0] for k in (1, 2))

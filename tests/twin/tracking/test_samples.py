@@ -1,15 +1,19 @@
 """What is drawn at random keeps to its ranges and shares."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
-from tests.twin.tracking.takes import ranges, rig
+from tests.twin.tracking.takes import ranges, rig, rig_of_three
+from twin.tracking.mesh_bank import all_uncovered, build_bodies
 from twin.tracking.samples import draw, facing
 from twin.tracking.sampling_ranges import PoseRanges
-from twin.tracking.study_samples import HALF_MM, TILT_DEG, study_take
-from twin.tracking.target_truth import view_truth
+from twin.tracking.study_samples import HALF_MM, MARGIN_PX, TILT_DEG, bodies_take, study_take
+from twin.tracking.target_truth import board_corners, view_truth
 
 RIG, COUNT = rig(), 150
 
@@ -83,6 +87,63 @@ def test_studies_keep_to_the_working_volume():
             truth = view_truth(take, device, 0.0, RIG.target)
             assert truth.inside.all()
             assert truth.blur_px == pytest.approx(12, abs=5)
+
+
+@pytest.fixture(scope="module")
+def three():
+    rig = rig_of_three()
+    bank = build_bodies(rig, 1, 2)
+    return rig, bank, [bodies_take(bank, rig, ranges(variants=1), 2, k, (20.0, 90.0), (0.0, 12.0)) for k in range(12)]
+
+
+def test_several_bodies_stand_apart_in_both_views(three):
+    """No two boards share a pixel; all lie within the images, and within the working volume."""
+    rig, _, takes = three
+    for take in takes:
+        for device in take.cameras:
+            count = np.zeros(device.optics.size[::-1], np.uint8)
+            for name, held in take.held.items():
+                corners = device.optics.camera().project(
+                    rigid.apply(held.motion.world_from_target, board_corners(rig.targets[name]))
+                )
+                assert (corners > MARGIN_PX).all() and (corners < np.array(device.optics.size) - 1 - MARGIN_PX).all()
+                count += cv2.fillConvexPoly(np.zeros_like(count), np.floor(corners + 0.5).astype(np.int32), 1)
+            assert count.max() == 1
+        assert all(600 < held.motion.world_from_target[2, 3] < 760 for held in take.held.values())
+
+
+def test_several_bodies_move_each_by_itself(three):
+    """Blur is even from 0 to 12 px, light log-even: means within 4 standard deviations; turns add a little."""
+    rig, _, takes = three
+    blur = np.array([
+        [view_truth(held, take.cameras[0], 0.0, rig.targets[name]).blur_px.mean() for name, held in take.held.items()]
+        for take in takes
+    ])  # fmt: skip
+    assert blur.max() < 16 and abs(blur.mean() - 6.3) < 4 * 12 / np.sqrt(12 * blur.size)
+    assert np.abs(np.corrcoef(blur.T)[np.triu_indices(3, 1)]).max() < 0.85
+    whites = np.log([take.white_dn for take in takes])
+    assert abs(whites.mean() - np.log(20 * 90) / 2) < 4 * np.log(90 / 20) / np.sqrt(12 * len(takes))
+
+
+def test_nothing_covers_the_circles_of_several_bodies(three):
+    """By the check that they are drawn with; a needle's board that is moved before the probe's fails it."""
+    rig, bank, takes = three
+    eyes = np.array([device.optics.camera().centre for device in takes[0].cameras])
+    for take in takes:
+        assert all_uncovered(bank, take, rig.targets, eyes)
+    needle = takes[0].others["needle"]
+    before = takes[0].motion.world_from_target.copy()
+    before[:3, 3] -= 0.1 * before[:3, 3]
+    covering = replace(needle, motion=replace(needle.motion, world_from_target=before))
+    assert not all_uncovered(bank, replace(takes[0], others={"needle": covering}), rig.targets, eyes)
+
+
+def test_a_take_of_several_bodies_depends_on_seed_and_number_alone(three):
+    rig, bank, takes = three
+    again = bodies_take(bank, rig, ranges(variants=1), 2, 7, (20.0, 90.0), (0.0, 12.0))
+    for name, held in again.held.items():
+        assert (held.motion.world_from_target == takes[7].held[name].motion.world_from_target).all()
+    assert (again.scene_from_world == takes[7].scene_from_world).all() and again.white_dn == takes[7].white_dn
 
 
 def test_ranges_the_wrong_way_round_are_refused_by_name():
