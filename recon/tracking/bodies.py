@@ -22,7 +22,7 @@ from recon.tracking.circle_detector import Detections
 from recon.tracking.constellations import Points
 from recon.tracking.pose import DISTINCT, GROSS_MM, distances
 from recon.tracking.pose_fit import lost
-from recon.tracking.rims import Outlines
+from recon.tracking.rims import Outlines, hole_of, measure_again
 from recon.tracking.tracker import NO_NETWORKS, Moment, Tracker, Tracking, paired, rank
 from recon.tracking.views import doubted
 
@@ -88,7 +88,7 @@ class BodyTracker:
         """Results of the bodies that aren't found yet, and those of the others with further bodies of their design."""
         for result in found.values():
             _take(detections, result)
-        claims = self._claims(*self._rings(detections))
+        claims = self._claims(detections.frames, *self._rings(detections))
         settled = _settled([claim for claim in claims if claim.name not in found])
         settled += _free([claim for claim in claims if claim.name in found], settled)
         results, others = dict(found), {name: list[Tracking]() for name in self.trackers}
@@ -138,13 +138,15 @@ class BodyTracker:
         both = rings[0], rings[1]
         return both, constellations.points_of(both, first.cameras)
 
-    def _claims(self, rings: tuple[Outlines, Outlines], points: Points) -> list[_Claim]:
+    def _claims(self, frames: tuple[NDArray, NDArray], rings: tuple[Outlines, Outlines], points: Points) -> list[_Claim]:
         """Each body at all rings that a pose of it fits."""
-        claims = []
+        claims, first = [], next(iter(self.trackers.values())).target
         for name, tracker in self.trackers.items():
             for choice in constellations.choices(points, tracker.target):
-                one, other = constellations.chosen_rims(rings, points, choice)
-                result = tracker.posed((tracker.judged(0, one), tracker.judged(1, other)), "detected")
+                rims = constellations.chosen_rims(rings, points, choice)
+                if hole_of(tracker.target) != hole_of(first):
+                    rims = [measure_again(frame, each, tracker.target) for frame, each in zip(frames, rims, strict=True)]
+                result = tracker.posed((tracker.judged(0, rims[0]), tracker.judged(1, rims[1])), "detected")
                 if result.found:
                     taken = frozenset((k, ring) for k in (0, 1) for ring in points.rings[choice[choice >= 0], k].tolist())
                     claims.append(_Claim(name, result, taken))

@@ -36,6 +36,7 @@ UNEVEN = 0.05  # of the contrast: white of a larger spread over the sectors isn'
 BENT_PX = 0.1  # times that share: standard deviation of a centre by uneven white
 LARGEST_BLUR = 0.35  # of the ring's width; beyond that its dark ring is gone
 LEAST_REACH_PX = 1.5
+AGAIN = 0.05  # of a disc's mean semi-axis, that a rim is off which was fitted as that of another ring
 FARTHEST = 0.4  # of the smaller semi-axis, that a rough rim may be off
 ELSEWHERE = "not at the place that the others predict"
 
@@ -158,6 +159,12 @@ def measure_both(
     return _judged(fits, np.zeros((len(fits), 5)), target, middles=True)
 
 
+def measure_again(image: NDArray, rims: Outlines, target: Target) -> Outlines:
+    """The same rims, fitted as rings of a target whose holes are of another size than those that were expected."""
+    again = measure(image, rims.ellipses, reach_px(rims.ellipses, AGAIN), target)
+    return again.without(np.flatnonzero(~rims.found))
+
+
 def reach_px(rough: Ellipses, share: float) -> Array:
     """Largest errors : (n,) px of n rough ellipses, a share of a disc's mean semi-axis: they grow with the discs."""
     return np.maximum(share * np.trace(rough.shape, axis1=1, axis2=2) / 2, LEAST_REACH_PX)
@@ -186,7 +193,7 @@ def _fitted(
     starts["a"], starts["b"], starts["c"] = rough.shape[:, 0, 0], rough.shape[:, 0, 1], rough.shape[:, 1, 1]
     for name in set(FIT.names) - {"found"}:
         fits[name] = np.nan
-    fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, _hole(target), fits)
+    fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, hole_of(target), fits)
     return fits
 
 
@@ -196,7 +203,8 @@ def _smaller_axis(ellipses: Ellipses) -> Array:
     return (a + c) / 2 - np.hypot((a - c) / 2, b)
 
 
-def _hole(target: Target) -> float:
+def hole_of(target: Target) -> float:
+    """Inner over outer diameter of a target's rings."""
     return target.inner_diameter_mm / target.outer_diameter_mm
 
 
@@ -213,7 +221,7 @@ def _widened(covariance: Array, times: Array, known: Array) -> Array:
 
 def _judged(fits: NDArray, known: Array, target: Target, middles: bool) -> Outlines:
     """Rims by their fits, with the inverse variances : (n, 5) px^-2 of what was known of them before."""
-    hole = _hole(target)
+    hole = hole_of(target)
     centre = np.stack([fits["x"], fits["y"]], axis=1)
     shape = np.stack([fits["a"], fits["b"], fits["b"], fits["c"]], axis=1).reshape(-1, 2, 2)
     inside, outside, middle, seen, spread = (fits[name] for name in ("inside", "outside", "middle", "seen", "uneven"))

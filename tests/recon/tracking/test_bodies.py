@@ -159,3 +159,16 @@ def test_points_are_chosen_by_distances_alone(rig, rng):
 def test_frames_of_another_size_are_refused_for_all(tracker):
     found = tracker.step(np.zeros((10, 10), np.uint8), np.zeros((10, 10), np.uint8))
     assert all("expected an image of 1280x1024" in one.pose.reason for one in found.values())
+
+
+def test_bodies_may_have_circles_of_other_sizes(rig, cameras, found_by, places):
+    """A needle with the probe's distances, but circles of 13 mm whose holes are wider: sizes tell them."""
+    small = rig.target.model_dump() | {"outer_diameter_mm": 13.0, "inner_diameter_mm": 6.5}
+    other = Rig.model_validate(rig.model_dump() | {"bodies": {"needle": small}})
+    shown = pair(cameras, [(places[name], target) for name, target in other.targets.items()], np.random.default_rng(9))
+    tracker = of(other, cameras, found_by)
+    for time_s in (0.0, 0.02):
+        found = tracker.step(*shown, time_s)
+        for name, one in found.items():
+            assert one.found, f"{name}: {one.pose.reason}"
+            assert off_mm(one, places[name]) < 0.05
