@@ -88,9 +88,9 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         sound_in_water.speed_of_sound(settings.temperature_c)  # a mistake shows before the work
     runs = list(read_runs(settings, usual, watch))
     repeated = compare(runs, settings)
-    for line in describe(repeated):
-        watch.say(line)
     figures = measure(repeated)
+    for line in describe(repeated, figures):
+        watch.say(line)
     if earlier is not None:
         figures |= probe_figures.compare(repeated.mean.calibration, earlier)
         watch.say(probe_figures.describe_comparison(figures, settings.earlier))
@@ -284,9 +284,8 @@ def rows(repeated: Repeated) -> Iterator[tuple[object, ...]]:
         yield number, run.name, *counts, *shown, *scale, f"{chance:.3g}" if np.isfinite(chance) else ""
 
 
-def describe(repeated: Repeated) -> Iterator[str]:
+def describe(repeated: Repeated, figures: Metrics) -> Iterator[str]:
     """Lines: a table of the runs, their repeatability, and the mean with its uncertainty."""
-    figures = measure(repeated)
     yield "run          used     RMS  noise  held out   shift    turn  chance  source"
     yield "                       mm     mm        mm      mm     deg"
     for row in rows(repeated):
