@@ -101,6 +101,8 @@ COMMANDS = (
     Command("calibrate-probe", ("capture=wires/capture", "earlier=probe/probe.yaml"), ("wires", "probe"),
             (*_sweep("wires"), "probe/probe.yaml")),
     Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
+    Command("calibrate-probe", ("runs=[noisy_pairs.csv,probe]",), ("noisy_pairs.csv", "probe"),
+            ("noisy_pairs.csv", "probe/probe.yaml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
     Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
@@ -196,6 +198,7 @@ def _write_others(folder: Path) -> None:
         folder / "poses.csv", [[time, 0, 10 * (time - 99), 650, 0, 0, 0, 1] for time in (99.0 + np.arange(60) / 20).tolist()]
     )
     (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
+    (folder / "noisy_pairs.csv").write_text(_pairs(folder, noise_px=0.3), encoding="utf-8")
     _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
     _write_what_is_projected(folder)
@@ -261,7 +264,7 @@ def _write_small_ones(folder: Path) -> None:
     torch.save({"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}, folder / "small.pt")
 
 
-def _pairs(folder: Path) -> str:
+def _pairs(folder: Path, noise_px: float = 0.0) -> str:
     """Poses and pixels of a crossing at rest, by a calibration that is there, a pair a line."""
     probe, rng = probe_files.read(folder / "probe" / "probe.yaml"), np.random.default_rng(0)
     names = [f"m{i}{j}" for i in range(3) for j in range(4)]
@@ -269,7 +272,8 @@ def _pairs(folder: Path) -> str:
     for pixel in rng.uniform([40, 60], [280, 340], (20, 2)):
         turn = Rotation.from_euler("xyz", rng.uniform(-30, 30, 3), degrees=True).as_matrix()
         pose = rigid.transform(turn, np.array([0.0, 0.0, 650.0]) - turn @ probe.to_target(pixel[None])[0])
-        lines.append(",".join(f"{value:.9g}" for value in (*pose[:3].ravel(), *pixel)))
+        seen = pixel + noise_px * rng.standard_normal(2)
+        lines.append(",".join(f"{value:.9g}" for value in (*pose[:3].ravel(), *seen)))
     return "\n".join(lines) + "\n"
 
 

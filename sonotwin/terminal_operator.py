@@ -8,7 +8,7 @@ from rich.console import Console
 
 from recon.acquisition.guidance import Answer, Step
 
-ENDS, KEEPS = ("e", "end", "q", "quit"), ("k", "keep")
+ENDS, KEEPS, DROPS = ("e", "end", "q", "quit"), ("k", "keep"), ("d", "delete")
 
 
 class TerminalOperator:
@@ -25,7 +25,7 @@ class TerminalOperator:
         self._console.print(f"next        {step.text} (Enter; e ends)", markup=False)
 
     def answer(self) -> Answer:
-        """`take` for each line, `keep` for k, `end` for e or the end of the input, `wait` meanwhile."""
+        """`take` for each line, `keep` for k, `drop` for d, `end` for e or the end of the input, `wait` meanwhile."""
         if self._over:
             return "end"
         try:
@@ -34,7 +34,7 @@ class TerminalOperator:
             return "wait"
         word = ENDS[0] if line is None else line.strip().lower()
         self._over = word in ENDS
-        return "end" if self._over else "keep" if word in KEEPS else "take"
+        return "end" if self._over else "keep" if word in KEEPS else "drop" if word in DROPS else "take"
 
     def _read(self) -> None:
         for line in sys.stdin:

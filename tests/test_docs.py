@@ -129,6 +129,20 @@ def test_examples_of_a_verb_are_valid(verb):
             read_by(example)
 
 
+def test_films_of_one_folder_show_one_print():
+    """A target's print is drawn from the seed: who measures it by one page's film tracks another page's by the same."""
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    manuals = [(ROOT / (verb.module.replace(".", "/") + ".py")).read_text(encoding="utf-8") for verb in VERBS]
+    lines = [recipe for text in texts for recipe in commands(text)]
+    lines += [shlex.split(line)[1:] for text in manuals for line in re.findall(r"^ +(sonotwin film [^\n]*)$", text, re.MULTILINE)]
+    seeds: dict[str, set[str]] = {}
+    for fields in (dict(field.split("=", 1) for field in line[1:]) for line in lines if line[0] == "film"):
+        seeds.setdefault(fields["out"], set()).add(fields.get("seed", "0"))
+    assert {"outputs/film", "outputs/turned"} <= seeds.keys()
+    assert all(len(found) == 1 for found in seeds.values()), seeds
+    assert seeds["outputs/film"] == seeds["outputs/turned"]
+
+
 @pytest.mark.slow
 def test_the_readme_runs(tmp_path, monkeypatch, rig):
     """Its recipes, one after the other, on images like those that a reader would have, by cameras of half the size."""

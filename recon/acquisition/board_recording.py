@@ -11,7 +11,7 @@ from recon.acquisition import frame_checks
 from recon.acquisition.board_guide import BoardGuide, new_guide
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.guidance import Operator, sentence
+from recon.acquisition.guidance import PENDING, Operator, sentence
 from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
@@ -66,7 +66,7 @@ def record_board(recording: Recording, stage: Stage, operator: Operator, plan: B
         answer = operator.answer()
         if answer == "end":
             break
-        if answer == "wait":
+        if answer in PENDING:
             continue
         if not names:
             lit = session.expose()

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Answer = Literal["wait", "take", "keep", "end"]
+Answer = Literal["wait", "take", "keep", "drop", "end"]
+PENDING = ("wait", "drop")  # where nothing can be dropped
 
 
 class Step(NamedTuple):
@@ -26,7 +27,7 @@ class Operator(Protocol):
     def answer(self) -> Answer:
         """`take` once it has been done, `keep` to take it whatever is wrong with it, `wait` until then; returns at once.
 
-        `end` if no more is to be recorded.
+        `drop` to delete the last one, where single things are taken; `end` if no more is to be recorded.
         """
 
 

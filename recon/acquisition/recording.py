@@ -232,6 +232,7 @@ class GrowingSweep:
     def __init__(self, recording: Recording, place: PartName, purpose: Purpose | None, devices: Mapping[str, Device]) -> None:
         self.place, self._recording, self._purpose, self._devices = place, recording, purpose, devices
         self._tables: dict[str, GrowingTable] = {}
+        self._before = recording.contents
         self._entering = threading.Lock()
 
     def add(self, device: str, number: int, time_ns: int, image: Images) -> None:
@@ -256,6 +257,35 @@ class GrowingSweep:
         self._tables[device].append(number, time_ns)
         self._enter()
         (folder / written_files.LIST).unlink(missing_ok=True)  # from now on the manifest names what is here
+
+    def drop(self, counts: Mapping[str, int]) -> None:
+        """Delete the last frames of devices : device -> their number; with the only ones of all, the sweep too.
+
+        A frame leaves its table before its image goes, so that the folder is readable at every moment.
+        """
+        if all(len(table) == counts.get(device, 0) for device, table in self._tables.items()):
+            self._leave()
+            return
+        for device, count in counts.items():
+            for _ in range(count):
+                number = self._tables[device].drop()
+                (self._recording.folder / self.place / device / image_name(number)).unlink()
+
+    def _leave(self) -> None:
+        """Take the sweep out of the manifest, and delete its files; those that a killed process leaves, the next one deletes."""
+        place = self._recording.folder / self.place
+        for device in self._tables:
+            atomic.begin_filled(place / device, RECORD)
+        self._recording._exchange(self._before)
+        self.close()
+        for device in self._tables:
+            self._recording._clear_unentered(place / device)
+            (place / device / written_files.LIST).unlink()
+        self._tables.clear()
+        for empty in (*(place / device for device in self._devices), place, place.parent):
+            if empty != self._recording.folder:
+                with suppress(OSError):  # of others' files, or of other sweeps
+                    empty.rmdir()
 
     def close(self) -> None:
         """End the tables."""
@@ -332,6 +362,10 @@ class GrowingTable:
         self._path = path
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o666)
         self._head = ",".join(STAMPS) + "\n"
+        self._rows: list[tuple[int, int]] = []  # frame, and size of the file before it
+
+    def __len__(self) -> int:
+        return len(self._rows)
 
     def append(self, frame: int, time_ns: int) -> None:
         """Add a row, in one call of the system; OSError if it doesn't fit on the disk, and the table stays as it was."""
@@ -345,6 +379,13 @@ class GrowingTable:
             error.filename = str(self._path)
             raise
         self._head = ""
+        self._rows.append((frame, before))
+
+    def drop(self) -> int:
+        """Remove the last row, in one call of the system; returns its frame."""
+        frame, before = self._rows.pop()
+        os.ftruncate(self._file, before)
+        return frame
 
     def close(self) -> None:
         """Close the file; may be called again."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.acquisition import frame_checks
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
-from recon.acquisition.guidance import Operator, Step, sentence
+from recon.acquisition.guidance import PENDING, Operator, Step, sentence
 from recon.acquisition.pictures import Say, Show
 from recon.acquisition.recording import Recording
 from recon.acquisition.still_session import StillSession
@@ -38,7 +38,7 @@ def record_surface(recording: Recording, stage: Stage, operator: Operator, plan:
     while True:
         lit = session.look()
         answer = operator.answer()
-        if answer == "wait":
+        if answer in PENDING:
             continue
         if answer in ("end", "keep"):
             break

@@ -13,7 +13,7 @@ from typing import Protocol
 from recon.acquisition import frame_checks
 from recon.acquisition.frame_checks import Limits
 from recon.acquisition.frame_stream import FrameStream, Taken
-from recon.acquisition.guidance import Operator, Step
+from recon.acquisition.guidance import PENDING, Operator, Step
 from recon.acquisition.pictures import Picture, Say, Show
 from recon.acquisition.recording import GrowingSweep, Recording
 from recon.acquisition.target_checks import Judge
@@ -74,7 +74,7 @@ class ScanSource(Scanner, Protocol):
         ...
 
 
-class _Reader(Protocol):
+class Reader(Protocol):
     """What reads the frames of one source."""
 
     def read(self, timeout_s: float) -> list[Taken] | None:
@@ -99,7 +99,7 @@ class SweepPlan:
 
 
 @dataclass
-class _Shown:
+class Shown:
     """When frames were looked at, and what was said of them."""
 
     show: Show
@@ -163,20 +163,20 @@ def record_sweep(
     """
     counts = dict.fromkeys(devices, 0)
     with recording.sweep(plan.name, plan.purpose, devices) as sweep:
-        shown = _Shown(show, say, judges, plan.limits, devices)
+        shown = Shown(show, say, judges, plan.limits, devices)
         operator.ask(Step(WORDS[plan.purpose]))
         if not _rehearsed(pairs, scanner, operator, plan, shown):
             return counts
         operator.ask(Step("recording; end it when you are through"))
         if pairs is not None:
             pairs.start(*plan.triggers)
-        readers, write = _readers(pairs, scanner, say), _writer(sweep, counts)
+        sources, write = readers(pairs, scanner, say), _writer(sweep, counts)
         with ExitStack() as stack:
             stack.callback(_say_counts, counts, say)
-            stack.callback(_stop, pairs, say)
-            for reader in readers:
+            stack.callback(stop, pairs, say)
+            for reader in sources:
                 stack.callback(_write_rest, reader, write)
-            streams = [FrameStream(reader.read, write, plan.silent_s, say) for reader in readers]
+            streams = [FrameStream(reader.read, write, plan.silent_s, say) for reader in sources]
             for stream in streams:
                 stack.callback(stream.end)
             _follow(streams, operator, plan, shown)
@@ -185,13 +185,13 @@ def record_sweep(
     return counts
 
 
-def _write_rest(reader: _Reader, write: Callable[[Taken], None]) -> None:
+def _write_rest(reader: Reader, write: Callable[[Taken], None]) -> None:
     """Write a reader's frames that waited for their times until the end."""
     for taken in reader.rest():
         write(taken)
 
 
-def _stop(pairs: PairSource | None, say: Say) -> None:
+def stop(pairs: PairSource | None, say: Say) -> None:
     """Stop the cameras, and say which frames are lost."""
     for lost in () if pairs is None else pairs.stop():
         say(f"lost {lost}")
@@ -201,14 +201,14 @@ def _say_counts(counts: Mapping[str, int], say: Say) -> None:
     say("recorded " + ", ".join(f"{count} frames of {device}" for device, count in counts.items()))
 
 
-def _rehearsed(pairs: PairSource | None, scanner: ScanSource | None, operator: Operator, plan: SweepPlan, shown: _Shown) -> bool:
+def _rehearsed(pairs: PairSource | None, scanner: ScanSource | None, operator: Operator, plan: SweepPlan, shown: Shown) -> bool:
     """Show what the devices see until the operator is ready; whether it is to be recorded then."""
     answer = operator.answer()
-    if answer != "wait":
+    if answer not in PENDING:
         return answer != "end"
     if pairs is not None:
         pairs.start(*plan.triggers)
-    while answer == "wait":
+    while answer in PENDING:
         latest = dict[str, Frame]()
         if pairs is not None and (pair := pairs.pair(POLL_S)) is not None:
             latest |= dict(zip(CAMERAS, pair.frames, strict=True))
@@ -221,16 +221,17 @@ def _rehearsed(pairs: PairSource | None, scanner: ScanSource | None, operator: O
     return answer != "end"
 
 
-def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: _Shown) -> None:
+def _follow(streams: Sequence[FrameStream], operator: Operator, plan: SweepPlan, shown: Shown) -> None:
     """Wait for the end of a recording, and show how it goes."""
-    while all(stream.alive for stream in streams) and operator.answer() == "wait":
+    while all(stream.alive for stream in streams) and operator.answer() in PENDING:
         if plan.seconds is not None and any(stream.span_s >= plan.seconds for stream in streams):
             break
         shown.look({device: frame for stream in streams for device, frame in stream.latest.items()})
         sleep(POLL_S)
 
 
-def _readers(pairs: PairSource | None, scanner: ScanSource | None, say: Say) -> list[_Reader]:
+def readers(pairs: PairSource | None, scanner: ScanSource | None, say: Say) -> list[Reader]:
+    """What reads the frames of those sources that are there."""
     return [*([] if pairs is None else [_PairReader(pairs, say)]), *([] if scanner is None else [_ScanReader(scanner)])]
 
 

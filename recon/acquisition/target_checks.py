@@ -14,6 +14,19 @@ Judged = tuple[str, tuple[str, ...]]  # figures, and faults with the ways to men
 Judge = Callable[[NDArray, int], Judged]  # of an image : (h, w) and its bits
 
 
+Places = Callable[[NDArray, int], NDArray[np.float64]]  # likewise; centres of the circles : (n, 2) px, NaN where not found
+
+
+def target_places(networks: Networks, target: Target) -> Places:
+    """Give what finds the target's circles in camera frames."""
+
+    def places(image: NDArray, bits: int) -> NDArray[np.float64]:
+        view = photographs.find(image, networks, target, bits if bits > 8 else None)
+        return np.where(view.found & view.outlines.found[:, None], view.outlines.ellipses.centre, np.nan)
+
+    return places
+
+
 def target_judge(networks: Networks, target: Target) -> Judge:
     """Give a judge of camera frames."""
     most_motion_px = 8.0  # of a circle over an exposure: what the tracker was measured with, and some more

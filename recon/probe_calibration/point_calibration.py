@@ -104,6 +104,7 @@ class Adjustment:
     noise_factor: float  # measured noise over the assumed; the covariance is scaled by its square
     apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
     moved: Movement | None = None  # what moved while the frames were taken; the values are those of the middle
+    by_lag: Array | None = None  # (8,) change of the calibration by one standard deviation of the lag, if the lag has one
 
     @property
     def rms_mm(self) -> float:
@@ -111,6 +112,11 @@ class Adjustment:
         program takes the three coordinates' mean square.
         """
         return float(np.sqrt((self.residuals[~self.outliers] ** 2).sum(axis=1).mean()))
+
+    @property
+    def noise_mm(self) -> float:
+        """The same with the frames counted less a third of the unknowns: an estimate of the distance by noise alone."""
+        return _noise_mm(self.residuals[~self.outliers], UNKNOWNS["wire"].stop + (self.apart_mm > 0))
 
 
 @dataclass(frozen=True)
@@ -202,8 +208,8 @@ def calibrate(
     estimate = estimate.moved(Step(np.pad(step, (0, len(UNKNOWNS) - used)), np.zeros((0, 0))))
     probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
     covariance = covariance[: len(NAMES), : len(NAMES)].copy()
-    if sightings.pose_by_lag is not None:
-        by_lag = _by_lag(estimate, sightings, noise, inliers)
+    by_lag = None if sightings.pose_by_lag is None else _by_lag(estimate, sightings, noise, inliers)
+    if by_lag is not None:
         covariance += np.outer(by_lag, by_lag)
     try:
         place = estimate.target_from_image, estimate.scale
@@ -217,9 +223,41 @@ def calibrate(
     calibration = ProbeCalibration(estimate.target_from_image @ ahead, estimate.scale, uncertainty)
     probe_checks.outcome(calibration, size, expected)
     chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
-    return Adjustment(
-        calibration, estimate.wire, _residuals(estimate, sightings), chi, ~inliers, factor, abs(estimate.apart), moved
-    )
+    left = _residuals(estimate, sightings)
+    return Adjustment(calibration, estimate.wire, left, chi, ~inliers, factor, abs(estimate.apart), moved, by_lag)
+
+
+def held_out_mm(
+    sightings: Sightings, found: Adjustment, probe: ProbeCalibration, noise: Noise | None = None, ahead_mm: float = 0.0
+) -> float:
+    """Distance, mm, of the crossing from one place by a calibration that these frames had no part in: root mean square.
+
+    The crossing's place is unknown, so that and the wires' distance are adjusted, and no more. A probe that was turned to all
+    sides shows an error of the calibration as scatter. `Adjustment.noise_mm` remains without such an error.
+
+    Parameters
+    ----------
+    sightings, found : of the frames, and what was adjusted to them; its outliers are left out
+    probe : for sound in the tank of the frames
+    noise, ahead_mm : as of `calibrate`
+    """
+    noise = noise or Noise()
+    behind = rigid.transform(np.eye(3), [0, ahead_mm, 0])
+    start = _Estimate(probe.target_from_image @ behind, probe.scale, found.wire)
+    seen = _with_wires(start, sightings, ~found.outliers) if found.apart_mm else sightings
+    seen = seen.of(~found.outliers)
+    slopes, left = _whitened(start, seen, noise)
+    free = np.arange(UNKNOWNS["wire"].start, len(UNKNOWNS) if seen.beside is not None else UNKNOWNS["wire"].stop)
+    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(KNOWN)
+    step = np.zeros(len(UNKNOWNS))
+    step[free] = -np.linalg.solve(information[np.ix_(free, free)], np.einsum("nij,ni->j", slopes, left)[free])
+    estimate = start.moved(Step(step, np.zeros((0, 0))))
+    return _noise_mm(_residuals(estimate, seen), len(free))
+
+
+def _noise_mm(residuals: Array, unknowns: int) -> float:
+    """Root mean square length of residuals : (n, 3) mm, with as many unknowns less."""
+    return float(np.sqrt((residuals**2).sum() / (len(residuals) - unknowns / 3)))
 
 
 def from_images(

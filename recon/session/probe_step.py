@@ -43,6 +43,9 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
     """its name, of a capture that holds several; "" takes the only one for the probe"""
     pairs: Path | None = None
     """CSV file of poses and pixels, one pair a line: m00 to m23 of world_from_target in mm, u, v in px"""
+    runs: tuple[Path, ...] = ()
+    """several calibrations of one probe, for their repeatability and mean: captures, each with a sweep or more for the probe, CSV
+    files as of pairs, and results of before, as files or folders. rig, temperature_c and wire_radius_mm hold for all of them"""
     earlier: Path | None = None
     """an earlier calibration of the same probe, probe.yaml: whether it moved in its bracket since"""
     clip: Rectangle | None = None
@@ -55,9 +58,11 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
 
     @model_validator(mode="after")
     def _one_source(self) -> "Settings":
-        given = [name for name in ("capture", "sequence", "pairs") if getattr(self, name) is not None]
+        given = [name for name in ("capture", "sequence", "pairs", "runs") if getattr(self, name) not in (None, ())]
         if len(given) != 1:
-            raise ValueError(f"expected one of capture, sequence and pairs, found {' and '.join(given) or 'none'}")
+            raise ValueError(f"expected one of capture, sequence, pairs and runs, found {' and '.join(given) or 'none'}")
+        if self.runs and self.sweep:
+            raise ValueError(f"sweep: expected none with runs, which takes all sweeps for the probe, found {self.sweep}")
         for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None), ("lag_sigma_s", self.lag_sigma_s or None)):
             if self.pairs is not None and value is not None:
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
@@ -66,7 +71,7 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
     @property
     def lag_sigma(self) -> float:
         """Standard deviation of the lag, s, wider of one that isn't given but assumed."""
-        assumed = self.capture is not None and self.lag_s is None
+        assumed = (self.capture is not None or self.runs) and self.lag_s is None
         return ASSUMED.lag_s if self.lag_sigma_s is None and assumed else self.lag_sigma_s or 0.0
 
 
@@ -101,9 +106,7 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         frames = crossing_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
         sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "probe")
-        if settings.lag_s is None and settings.lag_sigma:
-            sigma = f"± {1e3 * settings.lag_sigma:g} ms (1 sigma), of which rest alone is free"
-            watch.say(f"assumed     no lag of the B-scans, {sigma}; measure-lag finds it, give lag_s")
+        say_assumed(settings, watch)
         frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
     for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
@@ -115,6 +118,13 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         watch.say(probe_figures.describe_comparison(figures, settings.earlier))
     written = write(out, found, figures | seconds)
     watch.say(f"wrote       {out}/{{{','.join(written)}}}")
+
+
+def say_assumed(settings: Settings, watch: Watch) -> None:
+    """Say the lag that is assumed where none is given."""
+    if settings.lag_s is None and settings.lag_sigma:
+        sigma = f"± {1e3 * settings.lag_sigma:g} ms (1 sigma), of which rest alone is free"
+        watch.say(f"assumed     no lag of the B-scans, {sigma}; measure-lag finds it, give lag_s")
 
 
 def look(

@@ -5,6 +5,10 @@ rest in water, seen from many sides; or pairs of a pose and the crossing's pixel
 probe.yaml (with its covariance); the same in the rig authors' layout, US_params.npz; frames.csv, the outcome of each frame; and
 metrics.json. A calibration that is there already is replaced. Takes a second for thirty B-scans.
 
+Give several runs, in one capture or many, for their repeatability: CR1 and CR2 of Meza et al. 2021 beside those that the
+covariances predict, whether the runs scatter more than that (chi-square), and each run's crossing by the others' calibration
+(held out). probe.yaml is then their mean, with a covariance that has the scatter in it, and runs.csv has a row a run.
+
 Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees, mostly forward and backward, roll it as far as the
 target is seen, and bring the crossing near all corners of the image in turn.
 
@@ -13,12 +17,14 @@ target is seen, and bring the crossing near all corners of the image in turn.
     sonotwin calibrate-probe capture=outputs/wires/capture earlier=outputs/probe/probe.yaml out=outputs/probe_again
     sonotwin calibrate-probe sequence=wires.igs.mha reference=Tracker clip=[120,80,400,500] out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe
+    sonotwin calibrate-probe runs=[outputs/session/capture] temperature_c=22.4 out=outputs/probe
+    sonotwin calibrate-probe runs=[outputs/monday/probe.yaml,outputs/friday/probe.yaml] out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv rig.probe.image_size=[640,480] temperature_c=22.4 out=outputs/probe
 """
 
 from pathlib import Path
 
-from recon.session import probe_step
+from recon.session import probe_runs_step, probe_step
 from sonotwin import choices
 from sonotwin.console_watch import ConsoleWatch
 
@@ -27,9 +33,10 @@ class Config(probe_step.Settings):
     """Fields of `sonotwin calibrate-probe`: sources, target, and all that is known beforehand."""
 
     out: Path
-    """folder; gets probe.yaml, US_params.npz, frames.csv, metrics.json"""
+    """folder; gets probe.yaml, US_params.npz, frames.csv, metrics.json, and of several runs runs.csv"""
 
 
 def run(config: Config) -> None:
     """Find the crossing in all frames, calibrate, judge and write; raises InputError as `recon.session.probe_step.run`."""
-    probe_step.run(config, config.out, choices.read_rig().probe, ConsoleWatch())
+    step = probe_runs_step if config.runs else probe_step
+    step.run(config, config.out, choices.read_rig().probe, ConsoleWatch())

@@ -7,9 +7,11 @@ tracking the film.
 
     sonotwin film out=outputs/turned path.turn_deg=20 white_dn=120
     sonotwin calibrate-target capture=outputs/turned/capture out=outputs/target
+    sonotwin film out=outputs/film
     sonotwin track capture=outputs/film/capture target=outputs/target/target.yaml out=outputs/track
 
-Both films are of one seed: those of another show another print, of which this one's measures are wrong.
+Both films are of one seed, so of one print. A film of another seed shows another print, which is tracked worse by this one's
+measures than by the design: `track` warns of it.
 """
 
 from pathlib import Path

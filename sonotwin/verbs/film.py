@@ -7,7 +7,7 @@ projected centres, blur and visibility. Takes about a second a frame on two core
 first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
 
     sonotwin film out=outputs/film
-    sonotwin film out=outputs/film frames=120 seed=3 white_dn=20
+    sonotwin film out=outputs/dark frames=120 seed=3 white_dn=20
 """
 
 from collections.abc import Iterable, Iterator

@@ -15,6 +15,7 @@ that begins with `defaults: [basler]`: devices=ours.yaml.
     sonotwin record part=board patterns=paper_calibration out=outputs/session
     sonotwin record part=surface devices=basler calibration=optics.yaml out=outputs/session
     sonotwin record part=sweep name=scan purpose=volume out=outputs/session
+    sonotwin record part=sweep name=wires purpose=probe shots=true scene=crosswire path=wire out=outputs/session
 """
 
 from collections.abc import Iterator
@@ -32,10 +33,11 @@ from recon.acquisition.frame_checks import Limits
 from recon.acquisition.guidance import Operator
 from recon.acquisition.pictures import Say, Show, hidden
 from recon.acquisition.recording import SURFACE, Recording, open_recording
+from recon.acquisition.shot_recording import record_shots
 from recon.acquisition.still_session import as_set
 from recon.acquisition.surface_recording import SurfacePlan, record_surface
 from recon.acquisition.sweep_recording import SweepPlan, record_sweep
-from recon.acquisition.target_checks import target_judge
+from recon.acquisition.target_checks import target_judge, target_places
 from recon.artwork import projected_images
 from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.board_guidance.board_room import PoseLimits
@@ -125,6 +127,10 @@ class Config(NetworkFields):
     """of a sweep: probe (crossed wires), latency (a flat bottom), volume (what is to be seen)"""
     seconds: Positive | None = None
     """s between a device's first and newest frame by their time stamps, after which a sweep ends; null: when it is ended"""
+    shots: bool = False
+    """of a sweep: true takes shots of a probe at rest, one at a key, such as to calibrate it; another key deletes the last"""
+    most_moved_px: Positive = 1.0
+    """px, of the target's circles from the frames before a shot's B-scan to those after it: beyond, the probe moved"""
     silent_s: Positive = 5.0
     """s without a frame, after which a device counts as gone"""
     exposing: Exposing = Exposing()
@@ -159,6 +165,9 @@ class Config(NetworkFields):
             raise ValueError(
                 f"cameras: expected {FRINGE_CAMERA}, which sees the fringes of a board, found {', '.join(self.cameras)}"
             )
+        if self.shots and (self.part != "sweep" or self.seconds is not None):
+            found = f"part={self.part}" if self.part != "sweep" else f"seconds={self.seconds:g}"
+            raise ValueError(f"shots: expected with part=sweep, and without seconds, found {found}")
         return self
 
     @model_validator(mode="after")
@@ -265,13 +274,21 @@ def sweep(config: Config, recording: Recording, console: Console, say: Say, show
     silent_s = config.silent_s * (1 if isinstance(config.devices, LiveDevices) else SLOWER)
     triggers = config.devices.sweep_triggers if isinstance(config.devices, LiveDevices) else ("hardware", "hardware")
     plan = SweepPlan(config.name, config.purpose, triggers, config.seconds, silent_s, config.limits)
-    judge = target_judge(config.load_networks(config.rig.target.kind, threads=1), config.rig.target)
+    networks = config.load_networks(config.rig.target.kind, threads=1)
+    judge = target_judge(networks, config.rig.target)
     with sweep_devices(config, exposure_s, console) as (opened, operator, cameras):
         devices = dict(cameras)
         calibrations(config, recording, {name: device.size for name, device in devices.items()})
         if opened.scanner is not None:
             devices[SCANNER] = Device(size=opened.scanner.size)
-        record_sweep(recording, opened.pairs, opened.scanner, devices, operator, plan, dict.fromkeys(cameras, judge), say, show)
+        judges = dict.fromkeys(cameras, judge)
+        if not config.shots:
+            record_sweep(recording, opened.pairs, opened.scanner, devices, operator, plan, judges, say, show)
+            return
+        if opened.pairs is None or opened.scanner is None:
+            raise InputError("shots: expected two cameras and a scanner among the devices, found one of them missing")
+        most, places = config.most_moved_px, target_places(networks, config.rig.target)
+        record_shots(recording, opened.pairs, opened.scanner, devices, operator, plan, most, judges, places, say, show)
 
 
 Cameras = dict[str, Device]  # by name, as they are set
@@ -295,7 +312,7 @@ def sweep_devices(config: Config, exposure_s: float, console: Console) -> Iterat
     fields = {field: getattr(config, field) for field in ("rig", "scene", "ultrasound", "path", "clocks", "name", "seed")}
     settings = validated(SweepSettings, fields | {"filmed": True, "frames": frames}, "record")
     with console.status("setting up the scene"):
-        virtual = virtual_session.during_sweep(settings, ranges(), config.devices.paced)
+        virtual = virtual_session.during_sweep(settings, ranges(), config.devices.paced, config.shots)
     yield Opened(scanner=virtual.scanner, pairs=virtual.pairs), virtual.operator, dict(virtual.pairs.devices())
 
 

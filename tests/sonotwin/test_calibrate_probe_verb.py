@@ -262,8 +262,8 @@ def complaint(capsys, *fields: str) -> str:
 def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, rig, rng, tmp_path, capsys):
     out = tmp_path / "out"
     fields = [f"capture={capture}", f"out={out}"]
-    assert complaint(capsys, f"out={out}") == "calibrate-probe: expected one of capture, sequence and pairs, found none"
-    assert complaint(capsys, *fields, "pairs=a.csv").endswith("pairs, found capture and pairs")
+    assert complaint(capsys, f"out={out}") == "calibrate-probe: expected one of capture, sequence, pairs and runs, found none"
+    assert complaint(capsys, *fields, "pairs=a.csv").endswith("runs, found capture and pairs")
     assert complaint(capsys, *fields, "reference=Tracker").startswith("calibrate-probe: reference: expected none without a seq")
     assert complaint(capsys, f"out={out}", "pairs=a.csv", "lag_s=0.1").startswith("calibrate-probe: lag_s: expected none with")
     assert complaint(capsys, *fields, "noise.angle_deg=-1").startswith("calibrate-probe: noise.angle_deg: expected finite")

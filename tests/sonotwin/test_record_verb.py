@@ -14,8 +14,10 @@ from recon.acquisition.guidance import Step
 from recon.acquisition.recording import open_recording
 from recon.capture.board_part import read_board
 from recon.capture.manifest import Device, read_manifest
+from recon.capture.sweep_tables import read_stamps
 from recon.devices.interfaces import DeviceError
 from recon.errors import InputError
+from recon.model.tracks import MAX_GAP_S
 from sonotwin import cli, config
 from sonotwin.open_devices import LiveDevices
 from sonotwin.terminal_operator import TerminalOperator
@@ -59,6 +61,20 @@ def test_boards_and_sweeps_grow_in_one_capture(tmp_path, capsys, rig):
     assert "give another name=NAME" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_shots_of_virtual_wires_are_a_sweep_of_stills(tmp_path, capsys, rig):
+    """One a pose of the path, at rest, each with two pairs of frames near enough in time; no terminal is needed."""
+    wires = ("scene=crosswire", "path=wire", "path.count=2", "path.roll_deg=35", "name=wires", "purpose=probe", "shots=true")
+    out = tmp_path / "session"
+    assert cli.main(["record", "part=sweep", *wires, *QUIET, *half_as_fields(rig), "frames.quality.rim=2", f"out={out}"]) == 0
+    assert "recorded 2 shots" in capsys.readouterr().out
+    scans, pairs, others = (read_stamps(out / "sweep/wires" / name / "timestamps.csv")[1] for name in ("us", "cam1", "cam2"))
+    assert len(scans) == 2 and (pairs == others).all()
+    before, after = pairs.reshape(2, 2).T
+    assert (before < scans).all() and (scans <= after).all() and (after - before <= 1e9 * MAX_GAP_S).all()
+    assert read_manifest(out).sweeps["wires"].purpose == "probe"
+
+
 def composed(*overrides: str) -> Config:
     return config.load("record", ["part=surface", "out=x", *overrides], Config)
 
@@ -89,6 +105,9 @@ def test_images_have_up_to_as_many_bits_as_the_virtual_sensor():
         (["scene=board", "scene.kind=nothing"], "scene: kind: expected one of"),
         (["calibration=missing.yaml", "scene=plane"], "missing.yaml"),
         (["tracing.samples=3"], "record: tracing: samples: expected a power of two"),
+        (["shots=true"], "shots: expected with part=sweep, and without seconds, found part=surface"),
+        (["part=sweep", "shots=true", "seconds=3"], "shots: expected with part=sweep, and without seconds, found seconds=3"),
+        (["most_moved_px=0"], "most_moved_px: expected"),
         (["part=sweep", "path=none"], "record: path: expected one that leads the probe"),
     ],
 )
@@ -163,11 +182,11 @@ def test_a_surface_is_replaced_only_if_told(tmp_path, capsys, monkeypatch):
 
 
 def test_the_terminal_is_read_while_cameras_go_on(monkeypatch):
-    monkeypatch.setattr(sys, "stdin", StringIO("\n\nk\ne\n\n"))
+    monkeypatch.setattr(sys, "stdin", StringIO("\n\nk\nd\ne\n\n"))
     shown = StringIO()
     operator = TerminalOperator(Console(file=shown, soft_wrap=True))
     operator.ask(Step("hold the board in the middle"))
     answers = []
-    while len(answers) < 5:
+    while len(answers) < 6:
         answers += [answer] if (answer := operator.answer()) != "wait" else []
-    assert answers == ["take", "take", "keep", "end", "end"] and "hold the board" in shown.getvalue()
+    assert answers == ["take", "take", "keep", "drop", "end", "end"] and "hold the board" in shown.getvalue()

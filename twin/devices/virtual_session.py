@@ -69,11 +69,12 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
     return _devices(settings, held, _BoardHand(held.hold, patience * count))
 
 
-def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False) -> SweepDevices:
-    """Devices before a hand that leads the probe; InputError as of `plan_sweep`."""
+def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False, shots: bool = False) -> SweepDevices:
+    """Devices before a hand that leads the probe, and takes shots all along if so asked; InputError as of `plan_sweep`."""
     planned, turns = plan_sweep(settings), Turns(VirtualClock(paced))
     pairs, scanner = VirtualPair(planned, ranges, turns), VirtualScanner(planned, turns)
-    return SweepDevices(pairs, scanner, OneTake(lambda: pairs.over and scanner.over))
+    operator = EachTime if shots else OneTake
+    return SweepDevices(pairs, scanner, operator(lambda: pairs.over and scanner.over))
 
 
 def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: Operator) -> StillDevices:
@@ -113,3 +114,21 @@ class OneTake:
         if self._asked < 2:
             return "take"
         return "end" if self._over() else "wait"
+
+
+class EachTime:
+    """Takes whatever it is asked for, until it is over."""
+
+    def __init__(self, over: Callable[[], bool]) -> None:
+        self._over, self._asked = over, False
+
+    def ask(self, step: Step) -> None:
+        """Hear what is to be taken next."""
+        self._asked = True
+
+    def answer(self) -> Answer:
+        """`take` once a request, `end` when it is over, `wait` meanwhile."""
+        if self._over():
+            return "end"
+        asked, self._asked = self._asked, False
+        return "take" if asked else "wait"

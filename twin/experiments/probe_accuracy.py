@@ -37,7 +37,8 @@ ERROR_MM = 0.3  # of a calibration, at most
 WIRE_MM = 0.1  # radius of the scene's wires
 FEW = 20  # frames of a motion that is to be refused
 ALMOST_MM = 1e-3  # noise of a crossing that is known
-REPEATED = [f"{name}_{place}" for name in ("cr1", "cr2") for place in ("centre", "corners", "mean")]
+PLACES = ("centre", "corners", "mean")
+REPEATED = [f"{name}_{place}" for name in ("cr1", "cr2") for place in PLACES]
 LEFT_HANDED, X_AND_Y = np.diag([1.0, 1, -1, 1]), np.eye(4)[[1, 0, 2, 3]]
 
 
@@ -119,8 +120,8 @@ def errors(found: Sequence[ProbeCalibration], truth: ProbeCalibration, rig: Rig)
 def repeatabilities(found: Sequence[ProbeCalibration], rig: Rig) -> Array:
     """REPEATED : (6,) mm."""
     points = repeatability.five_points(rig.probe.image_size)
-    both = np.stack([repeatability.cr1(found, points), repeatability.cr2(found, points)])
-    return np.column_stack([both[:, 0], both[:, 1:].mean(axis=1), both.mean(axis=1)]).ravel()
+    both = [repeatability.at_places(values) for values in (repeatability.cr1(found, points), repeatability.cr2(found, points))]
+    return np.array([values[place] for values in both for place in PLACES])
 
 
 def squared_length(found: ProbeCalibration, truth: ProbeCalibration) -> float:

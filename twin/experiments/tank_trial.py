@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 CENTRE_MM = (4.0, -2.0, 670.29)  # of the inner cylinder's axis, where it lies in the outer one
 INNER, OUTER = {"kind": "inner_cylinder", "centre_mm": CENTRE_MM}, {"kind": "cylinders"}
 CAMERA_HZ = 20.0  # pairs of frames, in motion
-DRAWS = 2000  # of errors, for their expected distances
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
@@ -68,24 +67,13 @@ def probe_figures(lab: FilmedLaboratory, ours: Sequence[Result], paper: Sequence
     figures: Metrics = {}
     for name, found in (("ours", by_us), ("paper", by_paper)):
         for kind, values in (("cr1", repeatability.cr1(found, points)), ("cr2", repeatability.cr2(found, points))):
-            figures |= {f"{kind}_{place}_{name}_mm": value for place, value in at_places(values).items()}
+            figures |= {f"{kind}_{place}_{name}_mm": value for place, value in repeatability.at_places(values).items()}
         figures[f"probe_error_{name}_mm"] = rms(probe_accuracy.errors(found, truth, rig))
-    figures |= {f"cr1_{place}_predicted_mm": value for place, value in at_places(expected_cr1(by_us, points)).items()}
+    expected = repeatability.expected_cr1(np.stack([point_calibration.point_covariance(one, points) for one in by_us]))
+    figures |= {f"cr1_{place}_predicted_mm": value for place, value in repeatability.at_places(expected).items()}
     figures["equation_rms_ours_mm"] = rms(np.array([one.adjustment.rms_mm for one in ours]) / np.sqrt(3))
     figures["equation_rms_paper_mm"] = rms(np.array([one.rms_mm for one in paper]))
     return figures
-
-
-def at_places(values: Array) -> dict[str, float]:
-    """Figures of five points : (5,) as the paper gives them: of the centre, of the lower right corner, and their mean."""
-    return {"centre": float(values[0]), "corner": float(values[4]), "mean": float(values.mean())}
-
-
-def expected_cr1(found: Sequence[ProbeCalibration], points: Array) -> Array:
-    """CR1 : (5,) mm of pixels : (5, 2) that the calibrations' covariances predict: mean length of the difference of two."""
-    covariance = 2 * np.mean([point_calibration.point_covariance(one, points) for one in found], axis=0)
-    drawn = np.random.default_rng(0).standard_normal((DRAWS, 3))
-    return np.linalg.norm(drawn @ np.swapaxes(np.linalg.cholesky(covariance), -1, -2), axis=-1).mean(axis=1)
 
 
 def cylinder_figures(lab: FilmedLaboratory, ours: ProbeCalibration, paper: ProbeCalibration) -> Metrics:

@@ -450,3 +450,19 @@ def test_exact_poses_need_no_noise(probe, frames):
     """Nothing is inverted that is singular: a floor of a micrometre stands for none."""
     result = calibrate(Sightings(poses_of(probe, *frames), frames[1]), SIZE, Noise(0, 0, 0, 0))
     assert errors(result.calibration, probe).max() < 1e-6
+
+
+def test_a_calibrations_error_shows_in_frames_that_it_was_not_made_of(probe, frames, rng):
+    """By the true calibration the crossing scatters by noise alone; a shift adds its square, as the probe was turned about."""
+    held_out = {0.0: [], 0.5: []}
+    noise = []
+    for _ in range(8):
+        seen = observe(probe, *frames, rng)
+        found = calibrate(seen, SIZE, NOISE)
+        noise.append(found.noise_mm)
+        for shift, values in held_out.items():
+            moved = replace(probe, target_from_image=rigid.transform(np.eye(3), [0, shift, 0]) @ probe.target_from_image)
+            values.append(point_calibration.held_out_mm(seen, found, moved, NOISE))
+    level, true, off = (np.sqrt(np.mean(np.square(each))) for each in (noise, held_out[0.0], held_out[0.5]))
+    assert true == pytest.approx(level, rel=0.05)
+    assert np.sqrt(off**2 - true**2) == pytest.approx(0.5, rel=0.1)

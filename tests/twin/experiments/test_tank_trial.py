@@ -8,29 +8,11 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty
-from recon.model.probe import NAMES, ProbeCalibration
-from recon.probe_calibration import repeatability
+from recon.model.probe import ProbeCalibration
 from twin.experiments import tank_trial
 
 SCALE = np.array([0.1229, 0.1184])
 HELD = rigid.from_rotation_vector(np.array([0.3, -1.2, 0.4]), np.array([20.0, -15.0, 60.0]))
-SIGMAS = np.array([2e-4, 3e-4, 2e-3, 1e-3, 3e-3, 0.05, 0.08, 0.11])
-
-
-def test_the_expected_repeatability_is_that_of_drawn_calibrations():
-    """Mean distance over many pairs, each calibration drawn by the covariance that it claims."""
-    rng, points = np.random.default_rng(4), repeatability.five_points((321, 408))
-    claimed = Uncertainty(NAMES, np.diag(SIGMAS**2))
-    exact = ProbeCalibration(HELD, SCALE, claimed)
-    drawn = []
-    for step in SIGMAS * rng.standard_normal((300, 8)):
-        drawn.append(ProbeCalibration(rigid.moved(HELD, step[2:]), SCALE + step[:2], claimed))
-    assert repeatability.cr1(drawn, points) == pytest.approx(tank_trial.expected_cr1([exact, exact], points), rel=0.06)
-
-
-def test_figures_stand_at_the_papers_places():
-    assert tank_trial.at_places(np.array([1.0, 2, 3, 4, 10])) == {"centre": 1.0, "corner": 10.0, "mean": 4.0}
 
 
 def test_cylinders_by_masks_and_surface():
