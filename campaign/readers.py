@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files
+from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files, tip_files
 from recon.capture.surface_part import read_patterns
 from recon.clips import pose_tables
 from recon.clips.dialects import dicom_clip, video_clip
@@ -72,6 +72,7 @@ READERS = {
     "slstudio": Reader(calibration_files.read, ("for_slstudio/calibration.xml",), "file.xml"),
     "probe": Reader(probe_files.read, ("probe/probe.yaml",)),
     "target": Reader(lambda path: target_files.read(path, DESIGN), ("target/target.yaml",)),
+    "tip": Reader(tip_files.read, ("small_tip.yaml",)),
     "lag": Reader(lag_files.read, ("lag/lag.json",), "lag.json"),
     "stamps": Reader(sweep_tables.read_stamps, ("scan/capture/sweep/us/timestamps.csv",)),
     "track": Reader(sweep_tables.read_track, ("scan/capture/sweep/track.csv",)),
@@ -79,6 +80,8 @@ READERS = {
     "pose_table": Reader(lambda path: pose_tables.read(path, COLUMNS), ("poses.csv",)),
     "image": Reader(lambda path: images.read_image(path, (321, 408), 8), ("scan/capture/sweep/us/0003.png",)),
     "mesh": Reader(lambda path: meshes.read_ply(path, "a mesh"), ("small.ply",), "file.ply"),
+    "model_stl": Reader(lambda path: meshes.read_model(path, "a model"), ("needle.stl",), "file.stl"),
+    "model_glb": Reader(lambda path: meshes.read_model(path, "a model"), ("needle.glb",), "file.glb"),
     "volume_nrrd": Reader(volumes.read_volume, ("small.nrrd",), "file.nrrd"),
     "volume_mha": Reader(volumes.read_volume, ("small.mha",), "file.mha"),
     "sequence": Reader(_sequence, ("small.igs.mha",), "file.igs.mha"),

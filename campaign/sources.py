@@ -9,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from campaign import commands
 from campaign.commands import Run
-from recon.capture import probe_files, surface_part, sweep_part
+from recon.capture import probe_files, surface_part, sweep_part, sweep_tables, tip_files
 from recon.devices.openigtlink import igtl_messages
 from recon.files import atomic
 from recon.geometry import rigid
+from recon.model.tip import Tip
 from tests.recon.clips import made_clips
 from tests.recon.devices.openigtlink import igtl_peers
+from tests.recon.tip_calibration import pivot_films
 
 LONGEST_S = 600.0
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")
@@ -104,6 +106,7 @@ COMMANDS = (
     Command("calibrate-probe", ("runs=[noisy_pairs.csv,probe]",), ("noisy_pairs.csv", "probe"),
             ("noisy_pairs.csv", "probe/probe.yaml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
+    Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
     Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
             ("film", "target", "networks"),
@@ -203,6 +206,7 @@ def _write_others(folder: Path) -> None:
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
     _write_what_is_projected(folder)
     _write_small_ones(folder)
+    _write_tool(folder)
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
 
 
@@ -262,6 +266,20 @@ def _write_small_ones(folder: Path) -> None:
     messages = igtl_peers.all_kinds(np.random.default_rng(0))
     (folder / "small.igtl").write_bytes(b"".join(igtl_messages.pack(one, 1 + k % 2) for k, one in enumerate(messages)))
     torch.save({"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}, folder / "small.pt")
+
+
+def _write_tool(folder: Path) -> None:
+    """Poses of a needle that pivots in a dimple, the needle's mesh, and a tip's file."""
+    import trimesh
+
+    rng, length = np.random.default_rng(0), 150.0
+    needle = pivot_films.Tool(np.array([0.0, 0.0, -length]), np.array([0.0, 0.0, -1.0]))
+    poses = pivot_films.poses_of(pivot_films.turns(needle, rng), needle.tip)
+    sweep_tables.write_track(folder / "pivot.csv", pivot_films.tracked(poses, rng))
+    mesh = trimesh.creation.cone(1.0, length, sections=6).apply_transform(np.diag([1.0, -1, -1, 1]))
+    for suffix in (".stl", ".glb"):
+        mesh.export(folder / f"needle{suffix}")
+    tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis))
 
 
 def _pairs(folder: Path, noise_px: float = 0.0) -> str:

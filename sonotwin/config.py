@@ -32,7 +32,11 @@ from recon.files import yaml_text
 from recon.model.part import Kinds
 from recon.registry import Choice
 
-OF_ONE_VERB = {"devices/virtual": "record"}  # choices of a group that only this verb takes
+OF_SOME_VERBS = {  # choices of a group that only these verbs take
+    "devices/virtual": ("record",),
+    **dict.fromkeys(("path/hand", "path/pivot"), ("film",)),
+    **dict.fromkeys(("path/bob", "path/none", "path/raster", "path/stroke", "path/wire"), ("demo", "record", "sweep")),
+}
 NEEDED = "???"  # Hydra's mark of a field that needs a value
 BESIDE, WIDTH = 26, 100  # columns before the descriptions of fields in a verb's help, and of these
 MOST_NAMES = 12  # of keys in a message
@@ -160,7 +164,7 @@ def groups(verb: str) -> dict[str, list[str]]:
     entries = [key for entry in primary(verb).get("defaults", []) if isinstance(entry, dict) for key in entry]
     names = [re.sub(r"^(override |optional )*/?|@.*$", "", entry) for entry in entries]
     found = {name: sorted(choice.stem for choice in (folder() / name).glob("*.yaml")) for name in names}
-    return {name: [one for one in given if OF_ONE_VERB.get(f"{name}/{one}", verb) == verb] for name, given in found.items()}
+    return {name: [one for one in given if verb in OF_SOME_VERBS.get(f"{name}/{one}", (verb,))] for name, given in found.items()}
 
 
 def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:

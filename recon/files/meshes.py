@@ -81,12 +81,7 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
         raise InputError(f"{path}: expected {expected} as PLY, found a damaged one: {reason(error)}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: expected {expected} of triangles, found none in it")
-    farthest_mm = 1e7
-    if not (np.abs(mesh.vertices) < farthest_mm).all():
-        raise InputError(f"{path}: expected {expected} of finite places, below {farthest_mm:g} mm, found others among them")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
-        raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
+    _check_places(path, expected, mesh)
     stored = mesh.metadata["_ply_raw"]["vertex"]  # trimesh's own name, without a default: attributes would be lost in silence
     # of a vertex, for which meshes have their own places
     placed = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha")
@@ -102,6 +97,43 @@ def read_ply(path: Path, expected: str) -> trimesh.Trimesh:
             raise InputError(f"{path}: expected {expected} with {short(name)} of each vertex, found {found}")
         mesh.vertex_attributes[name] = values
     return mesh
+
+
+def read_model(path: Path, expected: str) -> trimesh.Trimesh:
+    """Read triangles from STL, GLB or PLY as they stand in the file, in its unit and axes; parts of one become one mesh.
+
+    expected : what the file is to be, for messages
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, of another kind, or holds no triangles.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    if kind == "ply":
+        return read_ply(path, expected)
+    if kind not in ("stl", "glb"):
+        raise InputError(f"{path}: expected {expected} as STL, GLB or PLY, found {path.suffix or 'no suffix'}")
+    data = read_bytes(path, expected=f"{expected} as {kind.upper()}")
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False)
+    except DAMAGE as error:
+        raise InputError(f"{path}: expected {expected} as {kind.upper()}, found a damaged one: {reason(error)}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: expected {expected} of triangles, found none in it")
+    _check_places(path, expected, mesh)
+    return mesh
+
+
+def _check_places(path: Path, expected: str, mesh: trimesh.Trimesh) -> None:
+    farthest_mm = 1e7
+    if not (np.abs(mesh.vertices) < farthest_mm).all():
+        raise InputError(f"{path}: expected {expected} of finite places, below {farthest_mm:g} mm, found others among them")
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        found = f"one of {mesh.faces.min()} to {mesh.faces.max()}"
+        raise InputError(f"{path}: expected {expected} of triangles between its {len(mesh.vertices)} vertices, found {found}")
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh) -> None:

@@ -5,37 +5,33 @@ by the path's own derivative in the middle of it.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
 from recon.capture.manifest import CAMERAS, Device
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model import circle_layout
 from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import Finite, NotNegative, Part, Positive, Rig, Target, Vector
+from recon.model.rig import Positive, Rig
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, describe
 from twin.shooting import FilmQuality, Quality, Shooting
+from twin.tracking.film_path import STILL, FilmPath
 from twin.tracking.mesh_bank import Bank, build_bank, uncovered
 from twin.tracking.rendered_views import Frames, render_film, render_full, white_radiance
 from twin.tracking.samples import Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth
-from twin.tremor import Tremor
 
 Array = NDArray[np.float64]
 
 TRUTH = "film.npz"  # in the sweep's own folder of truth
-STILL = conditions.Motion()
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
 NEAREST_MM = 100.0  # of a circle before a camera, along its axis
@@ -44,22 +40,12 @@ BATCH = 6  # frames traced in one launch; doesn't change them
 Views = tuple[ViewTruth, ViewTruth]
 
 
-class HandPath(Part):
-    """A closed round: the target's middle passes at even times through places, and turns about them as a hand does."""
-
-    seconds: Positive = 1.6  # a round
-    places_mm: Annotated[tuple[Vector, ...], Field(min_length=3)]  # in the world
-    roll_deg: Finite = 180.0  # of the target's x axis in the image, from left to right, on the whole
-    turn_deg: NotNegative = 6.0  # standard deviation about each axis, from place to place
-    unsteady_mm: NotNegative = 1.0  # of the places
-
-
 class Filming(Shooting):
     """Settings of a film."""
 
     frames: Annotated[int, Field(ge=1, le=100_000)] = 30
     camera_hz: Positive = 30.0
-    path: HandPath
+    path: FilmPath
 
     @model_validator(mode="after")
     def _one_after_the_other(self) -> "Filming":
@@ -73,70 +59,6 @@ class Filming(Shooting):
         return np.rint(np.arange(self.frames) * 1e9 / self.camera_hz).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class Way:
-    """A path at any time; both splines are closed."""
-
-    middle: CubicSpline  # (3,) mm in the world over s, of the circles' middle
-    turn: CubicSpline  # (3,) rotation vector in the world over s, from `facing`
-    facing: Array  # (3, 3)
-    middle_target: Array  # (3,) mm
-    tremor: Tremor  # of the hand, about the circles' middle
-
-    def pose(self, seconds: float) -> Array:
-        """`world_from_target` : (4, 4) mm."""
-        shaken = self.tremor.at(seconds)
-        turned = Rotation.from_rotvec(shaken[:3]).as_matrix() @ Rotation.from_rotvec(self.turn(seconds)).as_matrix() @ self.facing
-        return rigid.transform(turned, self.middle(seconds) + shaken[3:] - turned @ self.middle_target)
-
-    def velocity(self, seconds: float) -> tuple[Array, Array]:
-        """Of the target's origin : (3,) mm/s, and its turn : (3,) rad/s, in the world."""
-        shaken, rate = self.tremor.at(seconds), self.tremor.rate(seconds)
-        led = _left_jacobian(self.turn(seconds)) @ self.turn(seconds, 1)
-        spin = _left_jacobian(shaken[:3]) @ rate[:3] + Rotation.from_rotvec(shaken[:3]).as_matrix() @ led
-        lever = self.pose(seconds)[:3, :3] @ self.middle_target
-        return self.middle(seconds, 1) + rate[3:] - np.cross(spin, lever), spin
-
-    def motion(self, seconds: float, exposure_s: float) -> Motion:
-        """Over an exposure with its middle at a time."""
-        speed, spin = self.velocity(seconds)
-        return Motion(self.pose(seconds), speed * exposure_s, spin * exposure_s)
-
-
-def lead(path: HandPath, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL) -> Way:
-    """Lead the target along a path, its face to the point between the cameras : (3,) mm, as steadily as the path demands.
-
-    errors : of which the tremor is added.
-    """
-    rng = np.random.default_rng([seed, 2])
-    places = np.array(path.places_mm, float)
-    places = places + path.unsteady_mm * rng.standard_normal(places.shape)
-    turns = np.deg2rad(path.turn_deg) * rng.standard_normal(places.shape)
-    times = np.linspace(0, path.seconds, len(places) + 1)
-    middle, turn = (CubicSpline(times, np.vstack([rows, rows[:1]]), bc_type="periodic") for rows in (places, turns))
-    facing = _facing(eyes - places.mean(axis=0), path.roll_deg)
-    return Way(middle, turn, facing, circle_layout.middle(target), conditions.trembling(errors, seed))
-
-
-def _facing(towards: Array, roll_deg: float) -> Array:
-    """Rotation with z along a direction, and x turned by an angle from the image's, clockwise for those who look at the face."""
-    z = towards / np.linalg.norm(towards)
-    roll = np.deg2rad(roll_deg)
-    x = np.array([np.cos(roll), np.sin(roll), 0.0])
-    x = x - (x @ z) * z
-    x = x / np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
-
-
-def _left_jacobian(vector: Array) -> Array:
-    """From the rate of a rotation vector to the angular velocity in the fixed frame : (3, 3)."""
-    angle = float(np.linalg.norm(vector))
-    k = rigid.cross(vector)
-    if angle < 1e-4:
-        return np.eye(3) + k / 2 + k @ k / 6
-    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * k @ k
-
-
 def make_bank(rig: Rig, seed: int) -> Bank:
     """The bodies and surroundings that a film is chosen from."""
     return build_bank(rig.target, BODIES, seed)
@@ -147,15 +69,15 @@ def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int,
     light = ranges.light.model_copy(update={"projector_share": 0.0})
     drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
-    way = lead(filming.path, rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed, errors)
+    way = filming.path.lead(rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed, errors)
     motions = [way.motion(time * 1e-9, filming.exposure_s) for time in filming.times.tolist()]
     for motion in motions:
         places = rigid.apply(motion.world_from_target, circle_centres(rig.target))
         if min(rigid.apply(camera.camera_from_world, places)[:, 2].min() for camera in cameras) < NEAREST_MM:
-            raise InputError(f"path.places_mm: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
+            raise InputError(f"path: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
     some = [motions[k].world_from_target for k in np.linspace(0, len(motions) - 1, min(LOOKS, len(motions))).astype(int)]
     eyes = np.array([rigid.apply(rigid.invert(pose), camera.centre) for pose in some for camera in cameras])
-    moved = _farthest(filming.path) - drawn.motion.world_from_target[:3, 3]
+    moved = filming.path.room_mm - drawn.motion.world_from_target[:3, 3]
     lamps = drawn.lighting.lamps.copy()
     lamps[:, :3] += moved
     same = replace(
@@ -185,12 +107,6 @@ def in_a_row(
     return [
         replace(take, white_dn=shooting.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
     ]
-
-
-def _farthest(path: HandPath) -> Array:
-    """Where surroundings are set up : (3,) mm, so that the whole path lies in front of them."""
-    places = np.array(path.places_mm, float)
-    return np.append(places[:, :2].mean(axis=0), places[:, 2].max())
 
 
 def shoot(
@@ -224,7 +140,9 @@ def write_session(
             devices(rig, filming),
             name=session.part.partition("/")[2],
         )
-        truth.write_arrays(f"{session.part}/{TRUTH}", truth_arrays(filming.times, made, seen))
+        truth.write_arrays(
+            f"{session.part}/{TRUTH}", {**truth_arrays(filming.times, made, seen), **filming.path.truth(rig.target)}
+        )
 
 
 def devices(rig: Rig, shooting: Shooting) -> dict[str, Device]:

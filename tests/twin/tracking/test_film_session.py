@@ -41,7 +41,7 @@ def made(config, bank):
 
 @pytest.fixture(scope="module")
 def way(config):
-    return film_session.lead(config.path, config.rig.target, np.array([80.0, 0.0, 0.0]), 5)
+    return config.path.lead(config.rig.target, np.array([80.0, 0.0, 0.0]), 5)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.31, 0.77])
@@ -71,7 +71,7 @@ def test_over_an_exposure_the_target_moves_as_the_path(way):
 def test_a_trembling_hand_moves_as_fast_as_it_says(config):
     """The path's own speed and turn, and the tremor's, are the slopes of its poses."""
     eyes, shaky = np.array([50.0, 0, 0]), Motion(tremor_mm=0.2, tremor_deg=0.3)
-    calm, trembling = (film_session.lead(config.path, config.rig.target, eyes, 3, errors) for errors in (Motion(), shaky))
+    calm, trembling = (config.path.lead(config.rig.target, eyes, 3, errors) for errors in (Motion(), shaky))
     step = 1e-5
     for time in (0.1, 0.5, 0.93):
         before, after = trembling.pose(time - step), trembling.pose(time + step)
