@@ -4,6 +4,7 @@ Everything is in the target's frame, as in `handheld_assembly`: the board's fron
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class Look(Kinds):
 
     PACKAGE = "scenes.handheld.looks"
     USUAL = "board"
+    IN_A_HAND: ClassVar[bool] = False
 
     def parts(self, rng: np.random.Generator, target: Target, stand: Stand) -> tuple[Part, ...]:
         """All that moves with the target, its print first; what the look leaves open is drawn."""
@@ -41,6 +43,10 @@ class Look(Kinds):
 
     def tip_mm(self, target: Target) -> Array | None:
         """The tip : (3,) mm of a pointed body, None of others."""
+        return None
+
+    def line_mm(self, target: Target) -> Array | None:
+        """The middle line : (n, 3) mm of a part that is thinner than a few pixels, None without one."""
         return None
 
 
