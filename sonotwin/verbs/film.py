@@ -5,9 +5,11 @@ conf/dataset.yaml. The default path goes slowly, then fast, and partly out of ca
 Writes OUT/capture/, which `sonotwin track` reads like any hardware's, and OUT/truth/, which only evaluation opens: poses, motion,
 projected centres, blur and visibility. Takes about a second a frame on two cores (pixels=full: four), and a minute more when it
 first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
+With a rig that has further bodies, such as three_bodies, all of them are in view, each with its truth.
 
     sonotwin film out=outputs/film
     sonotwin film out=outputs/film frames=120 seed=3 white_dn=20
+    sonotwin film out=outputs/film rig=three_bodies
 """
 
 from collections.abc import Iterable, Iterator
