@@ -52,7 +52,7 @@ class Look(Kinds):
 
 def look_of(name: str) -> Look:
     """The look of a body that nothing is said of: that of its name, if there is one, or a board."""
-    return Look.named(name if name in registry.names(Look.PACKAGE) else Look.USUAL)()
+    return Look.model_validate({"kind": name if name in registry.names(Look.PACKAGE) else Look.USUAL})
 
 
 def any_stand(rng: np.random.Generator) -> Stand:
