@@ -3,10 +3,11 @@
 A program's name, such as `layout=kalibr`, `ros`, `mrcal` or `slstudio`, is for the calibration of cameras and projector alone,
 of a capture or as a file: Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's
 calibration.xml. `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with
-target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. Reads a capture folder, of a sweep
-with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold.
-B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else
-ever is. Takes seconds.
+target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. The pose is that of the frames in
+L/ and R/, taken a little before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. Reads a capture
+folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a
+capture doesn't hold. B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced
+whole, and nothing else ever is. Takes seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
@@ -29,21 +30,20 @@ from recon.capture import (
     calibration_files,
     manifest,
     meza2021_sweep,
+    paired_scans,
     probe_files,
     stereo_frames,
     surface_part,
     sweep_part,
 )
-from recon.capture.images import read_image
 from recon.capture.layouts import meza2021
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
-from recon.capture.stereo_frames import Film
-from recon.capture.sweep_part import SweepCapture
+from recon.capture.paired_scans import PairedScans
 from recon.errors import Implausible, InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
 from recon.model.probe import Speed
-from recon.model.rig import Part
+from recon.model.rig import Part, Positive
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import mass_files
@@ -81,6 +81,11 @@ class Config(Part):
     """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
     """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`"""
+    frames: bool = True
+    """also write L/ and R/, where the capture has frames, and the pose as these were taken; false writes B-scans alone, each with
+    the pose as it was taken"""
+    apart_s: Positive | None = None
+    """s, most between a B-scan and its frames; B-scans without nearer ones are left out. null takes the nearest"""
     tissue_m_s: Speed | None = None
     """m/s, of sound for which US_params.npz is to be right; null leaves it as the probe is calibrated"""
     masses: Path | None = None
@@ -133,7 +138,7 @@ def export_cameras(config: Config, console: Console) -> None:
     InputError
         If there is none, or one that the layout can't say; or if fields are given that aren't for it.
     """
-    for name in ("surface", "sweep", "probe", "lag_s", "tissue_m_s", "masses"):
+    for name in ("surface", "sweep", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses"):
         if (value := getattr(config, name)) != Config.model_fields[name].default:
             expected = f"none with layout={config.layout}, which is for the calibration of cameras alone"
             raise InputError(f"export: {name}: expected {expected}, found {value}")
@@ -173,14 +178,23 @@ def write_surface(folder: Path, config: Config) -> str:
 def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
     """Write the B-scans with their poses, frames and masks, and the probe's file; returns lines about them."""
     sweep = sweep_part.read_sweep(config.source, config.sweep, "volume", config.implausible)
-    poses = sweep.poses(config.lag_s)
-    placed = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
     _, part = held.sweep_of(config.source / MANIFEST, "a sweep", config.sweep, "volume")
-    filmed = set(CAMERAS) <= part.images.keys()
-    film = stereo_frames.read_film(config.source, config.calibration, config.sweep) if filmed else None
+    if config.frames and set(CAMERAS) <= part.images.keys():
+        film = stereo_frames.read_film(config.source, config.calibration, config.sweep)
+        paired = paired_scans.pair(sweep, film, config.lag_s, config.apart_s)
+        placed, poses, scan_poses = paired.scans, paired.poses, paired.scan_poses
+        images = paired_scans.images(sweep, film, paired)
+        lines = [
+            f"sweep       {len(placed)} of {len(sweep.paths)} B-scans, those with a pose, and the frames nearest to each",
+            told(paired),
+        ]
+    else:
+        scan_poses = sweep.poses(config.lag_s)
+        placed = np.flatnonzero(np.isfinite(scan_poses).all(axis=(1, 2)))
+        poses = scan_poses = scan_poses[placed]
+        images = ((SCANNER, number, sweep.image(k)) for number, k in enumerate(placed.tolist()))
+        lines = [f"sweep       {len(placed)} of {len(sweep.paths)} B-scans, those with a pose"]
     masks: Iterator[NDArray[np.uint8]] = iter(())
-    frames = ", with frames of both cameras" if film else ""
-    lines = [f"sweep       {len(placed)} of {len(poses)} B-scans, those with a pose{frames}"]
     probe = None if config.probe is None and sweep.probe is None else freehand_scans.probe_of(sweep, config.source, config.probe)
     if probe is not None:
         converted = sound_in_water.for_tissue(probe, config.tissue_m_s)
@@ -193,27 +207,23 @@ def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
         masks = _masks(meshes, scans.world_from_pixel[placed], sweep.size)
     elif config.masses is not None:
         raise InputError(f"{config.masses}: expected probe, the calibration by which masses lie in B-scans, found none")
-    meza2021_sweep.write_sweep(folder, _frames(sweep, film, placed, config.lag_s), masks, poses[placed])
+    meza2021_sweep.write_sweep(folder, images, masks, poses)
     return lines
+
+
+def told(paired: PairedScans) -> str:
+    """A line about the time between B-scans and their frames, and the probe's movement in it."""
+    apart, moved = 1e3 * np.abs(paired.apart_s), paired.moved_mm
+    return (
+        f"pose        that of the frames, {np.median(apart):.2g} ms from their B-scans (median; {apart.max():.2g} at most), in "
+        f"which the target moved by {np.median(moved):.2g} mm ({moved.max():.2g} at most); frames=false gives the B-scans' own"
+    )
 
 
 def write_optics(folder: Path, config: Config) -> list[str]:
     """Write the files of all pairs of cameras; returns a line about them."""
     optics = calibration_files.of_capture(config.source, config.calibration)
     return [] if optics is None else [f"optics      {', '.join(meza2021.write_parameters(folder, optics))}"]
-
-
-def _frames(sweep: SweepCapture, film: Film | None, placed: NDArray[np.intp], lag_s: float) -> Iterator[tuple[str, int, NDArray]]:
-    """B-scans, and the frames that were taken nearest to each."""
-    for number, k in enumerate(placed.tolist()):
-        yield SCANNER, number, sweep.image(k)
-        if film is not None:
-            taken = sweep.times[k] - round(lag_s * 1e9)
-            nearest = int(np.abs(film.times - taken).argmin())
-            both = next(path for row, path in enumerate(film.paths()) if row == nearest)
-            for device, path, camera, bits in zip(CAMERAS, both, film.cameras, film.depths, strict=True):
-                image = read_image(path, camera.size, bits)
-                yield device, number, (image >> (bits - 8)).astype(np.uint8)
 
 
 def _masks(masses: list[trimesh.Trimesh], world_from_pixel: NDArray, size: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:
