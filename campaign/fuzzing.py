@@ -20,7 +20,7 @@ MOST_FAULTS = 5  # of one reader, after which it isn't fuzzed on
 SPELL_S = 150  # of a process, after which another goes on with its inputs: libFuzzer itself grows by some hundred bytes an input
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "kalibr", "ros", "mrcal", "slstudio",
-    "probe", "target", "lag", "stamps", "track", "pairs",
+    "probe", "target", "lag", "stamps", "track", "authors_poses", "pairs",
     "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
     "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "checkpoint", "network",
 )  # fmt: skip

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files
+from recon.capture import calibration_files, images, lag_files, manifest, meza2021_sweep, probe_files, sweep_tables, target_files
 from recon.capture.surface_part import read_patterns
 from recon.clips import pose_tables
 from recon.clips.dialects import dicom_clip, video_clip
@@ -75,6 +75,7 @@ READERS = {
     "lag": Reader(lag_files.read, ("lag/lag.json",), "lag.json"),
     "stamps": Reader(sweep_tables.read_stamps, ("scan/capture/sweep/us/timestamps.csv",)),
     "track": Reader(sweep_tables.read_track, ("scan/capture/sweep/track.csv",)),
+    "authors_poses": Reader(lambda path: meza2021_sweep.read_rows(path, (4, 4)), ("sets/data1/target_pose.npy",), "file.npy"),
     "pairs": Reader(sweep_tables.read_pairs, ("pairs.csv",)),
     "pose_table": Reader(lambda path: pose_tables.read(path, COLUMNS), ("poses.csv",)),
     "image": Reader(lambda path: images.read_image(path, (321, 408), 8), ("scan/capture/sweep/us/0003.png",)),

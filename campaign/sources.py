@@ -42,6 +42,7 @@ MADE = (  # command lines in the order in which they are run
     ("segment", "capture=scan/capture", "out=masses"),
     ("calibrate-target", "capture=film/capture", "least_tilt_deg=0", "least_range_mm=0", "out=target"),
     ("export", "capture=ball/capture", "out=published"),
+    ("export", "layout=us_calibration", "capture=wires/capture", "out=sets"),
     ("check", "capture=bottom/capture", "lag=lag/lag.json", "log=rig.jsonl", "out=checked"),
     ("study", "name=sweep", "of=tracking", "film.frames=2", "over={film.rays: [16]}", "seeds=1", "out=study"),
 )  # fmt: skip
@@ -138,6 +139,10 @@ COMMANDS = (
             ("shots", "patterns.yaml", "for_slstudio"), ("for_slstudio/calibration.xml",), ("shots/0003.png",)),
     Command("import", ("folder=published",), ("published",),
             ("published/SLdata/images/3.png",)),
+    Command("export", ("layout=us_calibration", "capture=wires/capture"), ("wires",), _sweep("wires")),
+    Command("import", ("layout=us_calibration", "folder=sets"), ("sets",),
+            ("sets/data1/UScrop/US3.png",)),
+    Command("import", ("layout=stereo_basler", "folder=sets/data1"), ("sets",), ("sets/data1/UScrop/US3.png",)),
     Command("import-sweep", ("clip=scan.dcm", "poses=poses.csv", "starts_s=100", *POSES), ("scan.dcm", "poses.csv"),
             ("scan.dcm", "poses.csv")),
     Command("import-sweep", ("clip=screen.avi", "poses=poses.csv", *POSES), ("screen.avi", "poses.csv"), ("screen.avi",)),

@@ -4,7 +4,7 @@ The pose is that of the frames, from which such programs compute it anew. The B-
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,10 @@ Grey = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class PairedScans:
-    """m B-scans, in order of time; the same frames may be nearest to two of them."""
+    """m B-scans of a sweep, in order of time; the same frames may be nearest to two of them. Without a film they stand alone."""
 
+    sweep: SweepCapture
+    film: Film | None
     scans: NDArray[np.int64]  # (m,) which of the sweep
     pairs: NDArray[np.int64]  # (m,) which of the film
     apart_s: Array  # (m,) s, how much later the B-scan was taken than its frames
@@ -34,6 +36,27 @@ class PairedScans:
     def moved_mm(self) -> Array:
         """Movement of the target's origin between frames and B-scan : (m,) mm."""
         return np.linalg.norm((self.scan_poses - self.poses)[:, :3, 3], axis=1)
+
+    def chosen(self, which: NDArray) -> "PairedScans":
+        """Those that a mask or an index selects."""
+        columns = ("scans", "pairs", "apart_s", "poses", "scan_poses")
+        return replace(self, **{name: getattr(self, name)[which] for name in columns})
+
+    def images(self) -> Iterator[tuple[str, int, Grey]]:
+        """Images of 8 bits, one by one: device, number from 0 on, (h, w)."""
+        files = [] if self.film is None else list(self.film.paths())
+        for number, (scan, both) in enumerate(zip(self.scans.tolist(), self.pairs.tolist(), strict=True)):
+            yield SCANNER, number, self.sweep.image(scan)
+            if self.film is not None:
+                for device, path, camera, bits in zip(CAMERAS, files[both], self.film.cameras, self.film.depths, strict=True):
+                    yield device, number, (read_image(path, camera.size, bits) >> (bits - 8)).astype(np.uint8)
+
+
+def alone(sweep: SweepCapture, lag_s: float = 0.0) -> PairedScans:
+    """B-scans that have a pose, without frames; InputError if there is none."""
+    poses = sweep.poses(lag_s)
+    scans = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    return PairedScans(sweep, None, scans, np.full_like(scans, -1), np.zeros(len(scans)), poses[scans], poses[scans])
 
 
 def pair(sweep: SweepCapture, film: Film, lag_s: float = 0.0, most_apart_s: float | None = None) -> PairedScans:
@@ -49,30 +72,23 @@ def pair(sweep: SweepCapture, film: Film, lag_s: float = 0.0, most_apart_s: floa
     InputError
         If no B-scan, or no frame, has a pose, or none is near enough.
     """
-    scan_poses, frame_poses = sweep.poses(lag_s), tracks.at(sweep.track, film.times)
+    placed, frame_poses = alone(sweep, lag_s), tracks.at(sweep.track, film.times)
     frame_poses[np.isin(film.times, sweep.track.times[~sweep.track.found])] = np.nan  # which show no target, whatever lies around
-    scans, known = (np.flatnonzero(np.isfinite(poses).all(axis=(1, 2))) for poses in (scan_poses, frame_poses))
+    known = np.flatnonzero(np.isfinite(frame_poses).all(axis=(1, 2)))
     if not len(known):
         raise InputError(
             f"{sweep.name}: expected poses of the target as the frames were taken, found none: are the clocks others?"
         )
-    taken, moments = sweep.times[scans] - np.int64(round(lag_s * 1e9)), film.times[known]
+    taken, moments = sweep.times[placed.scans] - np.int64(round(lag_s * 1e9)), film.times[known]
     after = np.searchsorted(moments, taken).clip(0, len(moments) - 1)
     before = np.maximum(after - 1, 0)
-    pairs = np.where(taken - moments[before] <= np.abs(moments[after] - taken), before, after)
-    apart_s = (taken - moments[pairs]) * 1e-9
-    near = np.abs(apart_s) <= (np.inf if most_apart_s is None else most_apart_s)
+    nearest = np.where(taken - moments[before] <= np.abs(moments[after] - taken), before, after)
+    pairs, apart_s = known[nearest], (taken - moments[nearest]) * 1e-9
+    paired = replace(placed, film=film, pairs=pairs, apart_s=apart_s, poses=frame_poses[pairs])
+    if most_apart_s is None:
+        return paired
+    near = np.abs(apart_s) <= most_apart_s
     if not near.any():
         found = f"the nearest {1e3 * np.abs(apart_s).min():.3g} ms away"
-        raise InputError(f"{sweep.name}: expected frames within {1e3 * (most_apart_s or 0):g} ms of a B-scan, found {found}")
-    scans, pairs = scans[near], known[pairs[near]]
-    return PairedScans(scans, pairs, apart_s[near], frame_poses[pairs], scan_poses[scans])
-
-
-def images(sweep: SweepCapture, film: Film, paired: PairedScans) -> Iterator[tuple[str, int, Grey]]:
-    """Images of 8 bits, one by one: device, number from 0 on, (h, w)."""
-    files = list(film.paths())
-    for number, (scan, both) in enumerate(zip(paired.scans.tolist(), paired.pairs.tolist(), strict=True)):
-        yield SCANNER, number, sweep.image(scan)
-        for device, path, camera, bits in zip(CAMERAS, files[both], film.cameras, film.depths, strict=True):
-            yield device, number, (read_image(path, camera.size, bits) >> (bits - 8)).astype(np.uint8)
+        raise InputError(f"{sweep.name}: expected frames within {1e3 * most_apart_s:g} ms of a B-scan, found {found}")
+    return paired.chosen(near)

@@ -3,26 +3,29 @@
 A program's name, such as `layout=kalibr`, `ros`, `mrcal` or `slstudio`, is for the calibration of cameras and projector alone,
 of a capture or as a file: Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's
 calibration.xml. `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with
-target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. The pose is that of the frames in
-L/ and R/, taken a little before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. Reads a capture
-folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a
-capture doesn't hold. B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced
-whole, and nothing else ever is. Takes seconds.
+target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. `layout=us_calibration` is for
+their calibration of the probe: data1, data2, ... of a capture each, with L, R, UScrop, target_pose.npy, and cross_point.npy of
+the crossings found, beside cam1_cam2.npz and their config.yaml. The pose is that of the frames in L/ and R/, taken a little
+before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. Reads a capture folder, of a sweep with
+poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold.
+B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else
+ever is. Takes seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
     sonotwin export capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 tissue_m_s=1450 out=dataset
     sonotwin export capture=result/poses/scan surface=result/surface masses=result/masses/scan lag_s=0.05 out=dataset
+    sonotwin export layout=us_calibration capture=[first/poses/wires,second/poses/wires] out=for_their_calibration
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import PlainValidator
+from pydantic import Field, PlainValidator
 from rich.console import Console
 
 from recon import registry
@@ -36,9 +39,10 @@ from recon.capture import (
     surface_part,
     sweep_part,
 )
-from recon.capture.layouts import meza2021
-from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
+from recon.capture.layouts import meza2021, us_calibration
+from recon.capture.manifest import CAMERAS, MANIFEST, Purpose
 from recon.capture.paired_scans import PairedScans
+from recon.capture.sweep_part import SweepCapture
 from recon.errors import Implausible, InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
@@ -48,25 +52,28 @@ from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.segmentation import mass_files
 from recon.segmentation.scan_masks import mask_of
+from recon.session import probe_step
 from recon.session.skin_step import POINTS
 from sonotwin.console_watch import LineConsole
+from sonotwin.folder_lists import Folders
 
-MEZA = "meza2021"
+MEZA, SETS = "meza2021", "us_calibration"
 
 
 def known_layout(name: object) -> object:
     """The name of a layout of whole captures, or of a dialect of cameras that is written; else a refusal."""
-    return registry.one_of(name, [MEZA, *calibration_files.written()])
+    return registry.one_of(name, [MEZA, SETS, *calibration_files.written()])
 
 
 class Config(Part):
     """Fields of `sonotwin export`."""
 
     layout: Annotated[str, PlainValidator(known_layout)] = MEZA
-    """meza2021: the rig authors' data sets; a program's name, such as kalibr, ros, mrcal, slstudio: the calibration of
-    cameras and projector alone"""
-    capture: Path | None = None
-    """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it"""
+    """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; a program's name, such as
+    kalibr, ros, mrcal, slstudio: the calibration of cameras and projector alone"""
+    capture: Folders = Field(default=[])
+    """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it. us_calibration takes
+    several, a set each: [first,second]"""
     out: Path
     """folder; gets SLdata/, USdata/ and the files of calibrations, as far as the capture has them"""
     calibration: Path | None = None
@@ -74,7 +81,7 @@ class Config(Part):
     surface: Path | None = None
     """folder of `sonotwin surface`, whose points make the mask; null takes all pixels"""
     sweep: str = ""
-    """its name, of a capture that holds several; "" takes the only one for the volume"""
+    """its name, of a capture that holds several; "" takes the only one for the volume, or for the probe of us_calibration"""
     implausible: Implausible = "refuse"
     """poses that no hand makes: refuse leaves them out, and refuses if they are many; take uses all of them"""
     probe: Path | None = None
@@ -93,10 +100,12 @@ class Config(Part):
 
     @property
     def source(self) -> Path:
-        """The capture; InputError if none is given."""
-        if self.capture is None:
+        """The only capture; InputError if none is given, or several."""
+        if not self.capture:
             raise InputError("export: capture: needs a value; give capture=...")
-        return self.capture
+        if len(self.capture) > 1:
+            raise InputError(f"export: capture: expected one with layout={self.layout}, found {len(self.capture)}")
+        return self.capture[0]
 
 
 def run(config: Config) -> None:
@@ -108,9 +117,12 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
     """
     console = LineConsole()
-    given = (config.capture, config.calibration, config.surface, config.probe, config.masses)
+    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses)
     atomic.check_folder(config.out, "export", inputs=given)
     written = []
+    if config.layout == SETS:
+        export_sets(config, console)
+        return
     if config.layout != MEZA:
         export_cameras(config, console)
         return
@@ -121,11 +133,50 @@ def run(config: Config) -> None:
         elif config.surface is not None:
             written += [f"left out    the mask by {config.surface}: the capture has no fringe images of cam1"]
         if held.sweep is not None or held.sweeps:
-            written += write_sweep(folder, config, held)
+            written += write_sweep(folder, config)
         written += write_optics(folder, config)
         if not written:
             raise InputError(f"{config.source / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
     for line in written:
+        console.print(line, markup=False)
+    console.print(f"wrote       {config.out}", markup=False)
+
+
+def export_sets(config: Config, console: Console) -> None:
+    """Write a set for US-Calibration of each capture's sweep over crossed wires, with the crossings that are found.
+
+    Raises
+    ------
+    InputError
+        If there is none, a set has no B-scan with a pose, or sizes differ; or if fields are given that aren't for it.
+    """
+    refuse_others(config, ("surface", "probe", "tissue_m_s", "masses"), "of crossed wires alone")
+    if not config.capture:
+        raise InputError("export: capture: needs a value; give capture=...")
+    sizes = set()
+    with console.status("writing"), atomic.new_folder(config.out, "export") as folder:
+        lines = []
+        for number, capture in enumerate(config.capture, 1):
+            sweep = sweep_part.read_sweep(capture, config.sweep, "probe", config.implausible)
+            sizes.add(sweep.size)
+            if len(sizes) > 1:
+                expected = "x".join(map(str, (sizes - {sweep.size}).pop()))
+                raise InputError(f"{capture}: expected B-scans of {expected} px, as of {config.capture[0]}, found {sweep.size}")
+            frames = probe_step.look(sweep, lag_s=config.lag_s)
+            selected, about = select(sweep, capture, config, "probe")
+            crossings = np.array([frames.crossings[k].pixel for k in selected.scans.tolist()])
+            found = np.isin(selected.scans, frames.usable)
+            kept = selected.chosen(found) if found.any() else selected
+            name = us_calibration.write_set(folder, number, kept.images(), kept.poses, crossings[found] if found.any() else None)
+            crossed = (
+                f"{found.sum()} with a crossing, which alone count"
+                if found.any()
+                else "none with a crossing: PointSegment.py sets it"
+            )
+            lines += [f"{name:11} {about[0]}; {crossed}", *about[1:]]
+        optics = calibration_files.of_capture(config.capture[0], config.calibration)
+        lines.append(f"beside      {', '.join(us_calibration.write_settings(folder, sizes.pop(), optics))}")
+    for line in lines:
         console.print(line, markup=False)
     console.print(f"wrote       {config.out}", markup=False)
 
@@ -138,12 +189,10 @@ def export_cameras(config: Config, console: Console) -> None:
     InputError
         If there is none, or one that the layout can't say; or if fields are given that aren't for it.
     """
-    for name in ("surface", "sweep", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses"):
-        if (value := getattr(config, name)) != Config.model_fields[name].default:
-            expected = f"none with layout={config.layout}, which is for the calibration of cameras alone"
-            raise InputError(f"export: {name}: expected {expected}, found {value}")
-    if config.capture is not None:
-        optics = calibration_files.of_capture(config.capture, config.calibration)
+    others = ("surface", "sweep", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses")
+    refuse_others(config, others, "for the calibration of cameras alone")
+    if config.capture:
+        optics = calibration_files.of_capture(config.source, config.calibration)
     else:
         optics = None if config.calibration is None else calibration_files.read(config.calibration)
     if optics is None:
@@ -157,6 +206,13 @@ def export_cameras(config: Config, console: Console) -> None:
     if lost:
         console.print(f"left out    {', '.join(lost)}: the layout has no place for it", markup=False)
     console.print(f"wrote       {config.out}", markup=False)
+
+
+def refuse_others(config: Config, names: Sequence[str], what: str) -> None:
+    """Refuse fields that a layout doesn't take; `what` it is."""
+    for name in names:
+        if (value := getattr(config, name)) != Config.model_fields[name].default:
+            raise InputError(f"export: {name}: expected none with layout={config.layout}, which is {what}, found {value}")
 
 
 def write_surface(folder: Path, config: Config) -> str:
@@ -175,25 +231,11 @@ def write_surface(folder: Path, config: Config) -> str:
     return f"surface     {len(surface.images)} images, {100 * mask.mean():.1f} % of the pixels in the mask"
 
 
-def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
+def write_sweep(folder: Path, config: Config) -> list[str]:
     """Write the B-scans with their poses, frames and masks, and the probe's file; returns lines about them."""
     sweep = sweep_part.read_sweep(config.source, config.sweep, "volume", config.implausible)
-    _, part = held.sweep_of(config.source / MANIFEST, "a sweep", config.sweep, "volume")
-    if config.frames and set(CAMERAS) <= part.images.keys():
-        film = stereo_frames.read_film(config.source, config.calibration, config.sweep)
-        paired = paired_scans.pair(sweep, film, config.lag_s, config.apart_s)
-        placed, poses, scan_poses = paired.scans, paired.poses, paired.scan_poses
-        images = paired_scans.images(sweep, film, paired)
-        lines = [
-            f"sweep       {len(placed)} of {len(sweep.paths)} B-scans, those with a pose, and the frames nearest to each",
-            told(paired),
-        ]
-    else:
-        scan_poses = sweep.poses(config.lag_s)
-        placed = np.flatnonzero(np.isfinite(scan_poses).all(axis=(1, 2)))
-        poses = scan_poses = scan_poses[placed]
-        images = ((SCANNER, number, sweep.image(k)) for number, k in enumerate(placed.tolist()))
-        lines = [f"sweep       {len(placed)} of {len(sweep.paths)} B-scans, those with a pose"]
+    selected, about = select(sweep, config.source, config, "volume")
+    lines = [f"sweep       {about[0]}", *about[1:]]
     masks: Iterator[NDArray[np.uint8]] = iter(())
     probe = None if config.probe is None and sweep.probe is None else freehand_scans.probe_of(sweep, config.source, config.probe)
     if probe is not None:
@@ -204,20 +246,27 @@ def write_sweep(folder: Path, config: Config, held: Manifest) -> list[str]:
     if config.masses is not None and probe is not None:
         scans = freehand_scans.of_sweep(sweep, probe, config.lag_s, config.tissue_m_s)
         meshes = [mass.mesh for mass in mass_files.read_masses(config.masses).values()]
-        masks = _masks(meshes, scans.world_from_pixel[placed], sweep.size)
+        masks = _masks(meshes, scans.world_from_pixel[selected.scans], sweep.size)
     elif config.masses is not None:
         raise InputError(f"{config.masses}: expected probe, the calibration by which masses lie in B-scans, found none")
-    meza2021_sweep.write_sweep(folder, images, masks, poses)
+    meza2021_sweep.write_sweep(folder / meza2021_sweep.FOLDER, selected.images(), masks, selected.poses)
     return lines
 
 
-def told(paired: PairedScans) -> str:
-    """A line about the time between B-scans and their frames, and the probe's movement in it."""
+def select(sweep: SweepCapture, capture: Path, config: Config, purpose: Purpose) -> tuple[PairedScans, list[str]]:
+    """The B-scans that are written, with the frames nearest to each where these are, and lines about them."""
+    place, part = manifest.read_manifest(capture).sweep_of(capture / MANIFEST, "a sweep", config.sweep, purpose)
+    if not config.frames or not set(CAMERAS) <= part.images.keys():
+        selected = paired_scans.alone(sweep, config.lag_s)
+        return selected, [f"{len(selected.scans)} of {len(sweep.paths)} B-scans, those with a pose"]
+    film = stereo_frames.read_film(capture, config.calibration, place.partition("/")[2])
+    paired = paired_scans.pair(sweep, film, config.lag_s, config.apart_s)
     apart, moved = 1e3 * np.abs(paired.apart_s), paired.moved_mm
-    return (
-        f"pose        that of the frames, {np.median(apart):.2g} ms from their B-scans (median; {apart.max():.2g} at most), in "
-        f"which the target moved by {np.median(moved):.2g} mm ({moved.max():.2g} at most); frames=false gives the B-scans' own"
-    )
+    return paired, [
+        f"{len(paired.scans)} of {len(sweep.paths)} B-scans, those with a pose, and the frames nearest to each",
+        f"pose        that of the frames, {np.median(apart):.3g} ms from their B-scans (median; {apart.max():.3g} at most), in "
+        f"which the target moved by {np.median(moved):.2g} mm ({moved.max():.2g} at most); frames=false gives the B-scans' own",
+    ]
 
 
 def write_optics(folder: Path, config: Config) -> list[str]:

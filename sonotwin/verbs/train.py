@@ -20,7 +20,7 @@ from typing import Annotated
 
 import torch
 from matplotlib.figure import Figure
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
@@ -32,6 +32,7 @@ from recon.files.occupied import occupied
 from recon.model import circle_layout
 from recon.model.rig import Target
 from sonotwin.console_watch import LineConsole
+from sonotwin.folder_lists import Folders, listed
 from trainers import export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.checkpoints import TRAIN
@@ -48,18 +49,7 @@ LONGEST_FIELD = 300  # letters, of a value that a message asks for, such as fold
 MEMORY_SHARE = 0.5  # of what is free, for images, if memory_gb isn't given
 
 
-def _listed(value: object) -> object:
-    return [value] if isinstance(value, str | Path) else value
-
-
-def _each_once(folders: list[Path]) -> list[Path]:
-    for place, folder in enumerate(folders):
-        if folder.resolve() in (other.resolve() for other in folders[:place]):
-            raise ValueError(f"expected each folder once, found {folder} twice")
-    return folders
-
-
-Folders = Annotated[list[Path], BeforeValidator(_listed), AfterValidator(_each_once), Field(min_length=1)]
+SomeFolders = Annotated[Folders, Field(min_length=1)]
 
 
 class Config(BaseModel):
@@ -68,14 +58,14 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     network: Name
-    data: Folders
+    data: SomeFolders
     out: Path
     steps: Annotated[int, Field(ge=1)] | None = None
     max_minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
     init: Path | None = None
     resume: bool = True
     partial: bool = False
-    validation_data: Folders | None = None
+    validation_data: SomeFolders | None = None
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.05
     batch: Annotated[int, Field(ge=2, le=4096)] | None = None
     crop_px: Annotated[int, Field(ge=64, le=240, multiple_of=8)] = 160
@@ -167,7 +157,7 @@ def check_resumed(config: Config) -> bool:
         return False
     try:
         before = json_text.read(marker)
-        before |= {name: _listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
+        before |= {name: listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
         differing = [name for name, value in settings(config).items() if name not in MAY_CHANGE and before[name] != value]
         expected = [f"{name}={given(before[name])}" for name in differing]
     except (ValueError, KeyError, TypeError, RecursionError):

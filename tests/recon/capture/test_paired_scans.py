@@ -51,7 +51,7 @@ def test_the_pose_is_that_of_the_nearest_frames_that_have_one(tmp_path):
     assert paired.poses[:, 0, 3] == pytest.approx(SPEED * frame_s[paired.pairs], abs=1e-6)
     assert paired.scan_poses[:, 0, 3] == pytest.approx(SPEED * scan_s, abs=1e-6)
     assert paired.moved_mm == pytest.approx(SPEED * np.abs(paired.apart_s), abs=1e-5) and paired.moved_mm.max() > 1
-    values = {(device, number): int(image[0, 0]) for device, number, image in paired_scans.images(sweep, film, paired)}
+    values = {(device, number): int(image[0, 0]) for device, number, image in paired.images()}
     assert values == {
         key: int(value) for m in range(40) for key, value in (((SCANNER, m), m), *(((c, m), paired.pairs[m]) for c in CAMERAS))
     }
