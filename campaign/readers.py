@@ -18,7 +18,7 @@ from recon.rig_check import check_log
 from recon.skin_projection import planned_cut
 from recon.tracking import networks
 from sonotwin import config
-from trainers import export, shard_reader
+from trainers import export, markerpose_layout, shard_reader
 from twin import session
 
 
@@ -94,6 +94,7 @@ READERS = {
     "cut": Reader(planned_cut.read, ("cut.mrk.json",)),
     "points": Reader(lambda path: npz.read(path, POINTS), ("small.npz",)),
     "shard": Reader(_shard, ("data/shard-00000.tar",), "shard-00000.tar"),
+    "centres": Reader(markerpose_layout.read_table, ("markerpose/data_centers.csv",), "data_centers.csv"),
     "checkpoint": Reader(export.read_state, ("small.pt",)),
     "network": Reader(lambda path: networks.session(path, networks.SEGMENTER), ("networks/segmenter.onnx",), "file.onnx"),
 }  # fmt: skip

@@ -1,24 +1,27 @@
 """Write a capture in another group's layout, for their programs.
 
-A program's name, such as `layout=kalibr`, `ros`, `mrcal` or `slstudio`, is for the calibration of cameras and projector alone,
-of a capture or as a file: Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's
+A program's name, such as `layout=kalibr`, `ros`, `mrcal` or `slstudio`, is for the calibration of cameras and projector alone, of
+a capture or as a file: Kalibr's camchain.yaml, ROS's camera_info and mrcal's cameramodel with a file a device, SLStudio's
 calibration.xml. `layout=meza2021` is that of the rig's authors: SLdata/images and mask.png, USdata/L, R, US and USmasks with
 target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. `layout=us_calibration` is for
 their calibration of the probe: data1, data2, ... of a capture each, with L, R, UScrop, target_pose.npy, and cross_point.npy of
 the crossings found, beside cam1_cam2.npz and their config.yaml. The pose is that of the frames in L/ and R/, taken a little
-before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. Reads a capture folder, of a sweep with
-poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs for what a capture doesn't hold.
-B-scans without a pose are left out. Writes into the folder `out`; an earlier export there is replaced whole, and nothing else
-ever is. Takes seconds.
+before or before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. `layout=markerpose` is for the
+training of their networks: of data sets, data_centers.csv with images/, patch120/ and mask120/; and for their example: of a film,
+images/L, R and StereoParams.xml. Reads a capture folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct`
+leave it, and results of other verbs for what a capture doesn't hold. B-scans without a pose are left out. Writes into the folder
+`out`; an earlier export there is replaced whole, and nothing else ever is. Takes seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
     sonotwin export capture=result/poses/scan probe=result/probe/probe.yaml lag_s=0.05 tissue_m_s=1450 out=dataset
     sonotwin export capture=result/poses/scan surface=result/surface masses=result/masses/scan lag_s=0.05 out=dataset
     sonotwin export layout=us_calibration capture=[first/poses/wires,second/poses/wires] out=for_their_calibration
+    sonotwin export layout=markerpose data=outputs/data out=for_their_training
+    sonotwin export layout=markerpose capture=outputs/film/capture networks=outputs/published out=for_their_example
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -39,13 +42,14 @@ from recon.capture import (
     surface_part,
     sweep_part,
 )
-from recon.capture.layouts import meza2021, us_calibration
+from recon.capture.layouts import markerpose, meza2021, us_calibration
 from recon.capture.manifest import CAMERAS, MANIFEST, Purpose
 from recon.capture.paired_scans import PairedScans
 from recon.capture.sweep_part import SweepCapture
 from recon.errors import Implausible, InputError
 from recon.files import atomic, npz
 from recon.freehand import scans as freehand_scans
+from recon.model.calibration import Calibration
 from recon.model.probe import Speed
 from recon.model.rig import Part, Positive
 from recon.model.tracks import LagSeconds
@@ -56,21 +60,26 @@ from recon.session import probe_step
 from recon.session.skin_step import POINTS
 from sonotwin.console_watch import LineConsole
 from sonotwin.folder_lists import Folders
+from trainers import data_sets, markerpose_layout, shard_reader
 
-MEZA, SETS = "meza2021", "us_calibration"
+MEZA, SETS, MARKERPOSE = "meza2021", "us_calibration", "markerpose"
+
+MEZA_NETWORKS = {"detector": "superpoint.pt", "segmenter": "ellipsegnet.pt"}
+MARKERPOSE_NETWORKS = {"detector": "py_superpoint.pt", "segmenter": "py_ellipsegnet.pt"}
 
 
 def known_layout(name: object) -> object:
     """The name of a layout of whole captures, or of a dialect of cameras that is written; else a refusal."""
-    return registry.one_of(name, [MEZA, SETS, *calibration_files.written()])
+    return registry.one_of(name, [MEZA, SETS, MARKERPOSE, *calibration_files.written()])
 
 
 class Config(Part):
     """Fields of `sonotwin export`."""
 
     layout: Annotated[str, PlainValidator(known_layout)] = MEZA
-    """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; a program's name, such as
-    kalibr, ros, mrcal, slstudio: the calibration of cameras and projector alone"""
+    """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; markerpose: their networks'
+    training data, and their example's; a program's name, such as kalibr, ros, mrcal, slstudio: the calibration of cameras and
+    projector alone"""
     capture: Folders = Field(default=[])
     """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it. us_calibration takes
     several, a set each: [first,second]"""
@@ -97,6 +106,11 @@ class Config(Part):
     """m/s, of sound for which US_params.npz is to be right; null leaves it as the probe is calibrated"""
     masses: Path | None = None
     """folder of `sonotwin segment`, whose masses make USmasks/; null writes none"""
+    data: Folders = Field(default=[])
+    """data sets of `sonotwin dataset`, one or several, for markerpose"""
+    networks: Path | None = None
+    """folder with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`; they go
+    out by the names that the scripts load. null writes none"""
 
     @property
     def source(self) -> Path:
@@ -117,11 +131,11 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
     """
     console = LineConsole()
-    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses)
+    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses, *config.data, config.networks)
     atomic.check_folder(config.out, "export", inputs=given)
     written = []
-    if config.layout == SETS:
-        export_sets(config, console)
+    if config.layout in (SETS, MARKERPOSE):
+        (export_sets if config.layout == SETS else export_markerpose)(config, console)
         return
     if config.layout != MEZA:
         export_cameras(config, console)
@@ -135,6 +149,7 @@ def run(config: Config) -> None:
         if held.sweep is not None or held.sweeps:
             written += write_sweep(folder, config)
         written += write_optics(folder, config)
+        written += write_networks(folder, config, MEZA_NETWORKS)
         if not written:
             raise InputError(f"{config.source / MANIFEST}: expected a surface of cam1, a sweep or a calibration, found none")
     for line in written:
@@ -150,7 +165,7 @@ def export_sets(config: Config, console: Console) -> None:
     InputError
         If there is none, a set has no B-scan with a pose, or sizes differ; or if fields are given that aren't for it.
     """
-    refuse_others(config, ("surface", "probe", "tissue_m_s", "masses"), "of crossed wires alone")
+    refuse_others(config, ("surface", "probe", "tissue_m_s", "masses", "data", "networks"), "of crossed wires alone")
     if not config.capture:
         raise InputError("export: capture: needs a value; give capture=...")
     sizes = set()
@@ -181,6 +196,42 @@ def export_sets(config: Config, console: Console) -> None:
     console.print(f"wrote       {config.out}", markup=False)
 
 
+def export_markerpose(config: Config, console: Console) -> None:
+    """Write a data set's views and patches for MarkerPose's training, a film's frames for its example, and networks, as given.
+
+    Raises
+    ------
+    InputError
+        If nothing is given, or a source is damaged or has nothing for it; or if fields are given that aren't for it.
+    """
+    others = ("surface", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses")
+    refuse_others(config, others, "of frames and networks alone")
+    if not config.data and not config.capture and config.networks is None:
+        raise InputError("export: data: needs a value with layout=markerpose, or capture or networks does; give data=...")
+    lines = []
+    with console.status("writing"), atomic.new_folder(config.out, "export") as folder:
+        if config.data:
+            views = data_sets.read_views(config.data)
+            lines.append(f"views       {markerpose_layout.write_views(folder, views)} of {len(views)}, those with all circles")
+            if shard_reader.has_patches(config.data):
+                patches = data_sets.read_patches(config.data)
+                lines.append(
+                    f"patches     {markerpose_layout.write_patches(folder, patches)} of {len(patches)}, those with a disc"
+                )
+            else:
+                lines.append("left out    patches: the data set has none, which frames=views writes")
+        if config.capture:
+            film = stereo_frames.read_film(config.source, config.calibration, config.sweep)
+            optics = Calibration(dict(zip(CAMERAS, film.cameras, strict=True)))
+            lines.append(
+                f"frames      {markerpose.write_film(folder, film.pairs(), film.depths, optics)} pairs, {markerpose.PARAMETERS}"
+            )
+        lines += write_networks(folder, config, MARKERPOSE_NETWORKS)
+    for line in lines:
+        console.print(line, markup=False)
+    console.print(f"wrote       {config.out}", markup=False)
+
+
 def export_cameras(config: Config, console: Console) -> None:
     """Write a calibration of cameras for another program.
 
@@ -189,7 +240,7 @@ def export_cameras(config: Config, console: Console) -> None:
     InputError
         If there is none, or one that the layout can't say; or if fields are given that aren't for it.
     """
-    others = ("surface", "sweep", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses")
+    others = ("surface", "sweep", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses", "data", "networks")
     refuse_others(config, others, "for the calibration of cameras alone")
     if config.capture:
         optics = calibration_files.of_capture(config.source, config.calibration)
@@ -267,6 +318,17 @@ def select(sweep: SweepCapture, capture: Path, config: Config, purpose: Purpose)
         f"pose        that of the frames, {np.median(apart):.3g} ms from their B-scans (median; {apart.max():.3g} at most), in "
         f"which the target moved by {np.median(moved):.2g} mm ({moved.max():.2g} at most); frames=false gives the B-scans' own",
     ]
+
+
+def write_networks(folder: Path, config: Config, names: Mapping[str, str]) -> list[str]:
+    """Write the networks by other names, after a check of their shape; returns a line about them."""
+    if config.networks is None:
+        return []
+    from trainers import export  # torch takes seconds to import
+
+    for network, name in names.items():
+        export.copy_published(config.networks / f"{network}.pt", folder / name, f"published_{network}")
+    return [f"networks    {', '.join(names.values())}"]
 
 
 def write_optics(folder: Path, config: Config) -> list[str]:

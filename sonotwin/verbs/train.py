@@ -1,6 +1,7 @@
 """Train a network of the tracker: the detector, which finds circles in a view, or the segmenter, which outlines one in a patch.
 
-Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds. Their images are decoded into memory,
+Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds; and folders of MarkerPose's training
+data (data_centers.csv with images/, patch120/ with mask120/), which come after these. Their images are decoded into memory,
 150 kB a sample for a detector and 170 kB for a segmenter, or read from the shards as they are needed where that is more than
 `memory_gb`; the training is the same either way. Writes into the folder `out`: the network as ONNX for the tracker, its weights
 as .safetensors and .pt with the published names, metrics.json of the validation samples, the curves as log.jsonl and curves.png,
@@ -10,6 +11,7 @@ half an hour to some hours; the published ones take 6 to 20 times as long.
 
     sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
     sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
+    sonotwin train network=segmenter data=outputs/dataset validation_data=theirs out=outputs/segmenter steps=5500
     sonotwin train network=detector data=[outputs/first,outputs/second] out=outputs/detector max_minutes=600 memory_gb=8
     sonotwin train network=detector data=outputs/more init=outputs/detector/detector.safetensors out=outputs/detector2 steps=5000
 """
@@ -33,7 +35,7 @@ from recon.model import circle_layout
 from recon.model.rig import Target
 from sonotwin.console_watch import LineConsole
 from sonotwin.folder_lists import Folders, listed
-from trainers import export, fit, free_memory, shard_reader
+from trainers import data_sets, export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.checkpoints import TRAIN
 from trainers.fit import Fitted, Plan, Precision
@@ -196,7 +198,7 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
     """Training and validation samples, in memory as far as they may be."""
-    reader = shard_reader.read_views if is_detector(config.network) else shard_reader.read_patches
+    reader = data_sets.read_views if is_detector(config.network) else data_sets.read_patches
     with console.status("reading") as status:
         data = reader(config.data, lambda count: status.update(f"reading, {count} samples"), config.partial)
         if config.validation_data is not None:
