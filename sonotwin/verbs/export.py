@@ -6,8 +6,8 @@ calibration.xml. `layout=meza2021` is that of the rig's authors: SLdata/images a
 target_pose.npy, and the files of all calibrations, US_params.npz for a chosen speed of sound. `layout=us_calibration` is for
 their calibration of the probe: data1, data2, ... of a capture each, with L, R, UScrop, target_pose.npy, and cross_point.npy of
 the crossings found, beside cam1_cam2.npz and their config.yaml. The pose is that of the frames in L/ and R/, taken a little
-before or before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. `layout=markerpose` is for the
-training of their networks: of data sets, data_centers.csv with images/, patch120/ and mask120/; and for their example: of a film,
+before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. `layout=markerpose` is for the training
+of their networks: of data sets, data_centers.csv with images/, patch120/ and mask120/; and for their example: of a film,
 images/L, R and StereoParams.xml. Reads a capture folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct`
 leave it, and results of other verbs for what a capture doesn't hold. B-scans without a pose are left out. Writes into the folder
 `out`; an earlier export there is replaced whole, and nothing else ever is. Takes seconds.
@@ -18,7 +18,7 @@ leave it, and results of other verbs for what a capture doesn't hold. B-scans wi
     sonotwin export capture=result/poses/scan surface=result/surface masses=result/masses/scan lag_s=0.05 out=dataset
     sonotwin export layout=us_calibration capture=[first/poses/wires,second/poses/wires] out=for_their_calibration
     sonotwin export layout=markerpose data=outputs/data out=for_their_training
-    sonotwin export layout=markerpose capture=outputs/film/capture networks=outputs/published out=for_their_example
+    sonotwin export layout=markerpose capture=outputs/film/capture networks=[detector,segmenter] out=for_their_example
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -108,9 +108,9 @@ class Config(Part):
     """folder of `sonotwin segment`, whose masses make USmasks/; null writes none"""
     data: Folders = Field(default=[])
     """data sets of `sonotwin dataset`, one or several, for markerpose"""
-    networks: Path | None = None
-    """folder with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`; they go
-    out by the names that the scripts load. null writes none"""
+    networks: Folders = Field(default=[])
+    """folders with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`; they
+    go out by the names that the scripts load"""
 
     @property
     def source(self) -> Path:
@@ -131,7 +131,7 @@ def run(config: Config) -> None:
         If the capture is incomplete or damaged, has nothing for the layout, or `out` can't be written to.
     """
     console = LineConsole()
-    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses, *config.data, config.networks)
+    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses, *config.data, *config.networks)
     atomic.check_folder(config.out, "export", inputs=given)
     written = []
     if config.layout in (SETS, MARKERPOSE):
@@ -140,6 +140,7 @@ def run(config: Config) -> None:
     if config.layout != MEZA:
         export_cameras(config, console)
         return
+    refuse_others(config, ("data",), "of captures alone; layout=markerpose takes data sets")
     held = manifest.read_manifest(config.source)
     with console.status("writing"), meza2021.new_folder(config.out) as folder:
         if held.surface is not None and "cam1" in held.surface.images:
@@ -175,8 +176,8 @@ def export_sets(config: Config, console: Console) -> None:
             sweep = sweep_part.read_sweep(capture, config.sweep, "probe", config.implausible)
             sizes.add(sweep.size)
             if len(sizes) > 1:
-                expected = "x".join(map(str, (sizes - {sweep.size}).pop()))
-                raise InputError(f"{capture}: expected B-scans of {expected} px, as of {config.capture[0]}, found {sweep.size}")
+                expected, there = ("x".join(map(str, size)) for size in ((sizes - {sweep.size}).pop(), sweep.size))
+                raise InputError(f"{capture}: expected B-scans of {expected} px, as of {config.capture[0]}, found {there}")
             frames = probe_step.look(sweep, lag_s=config.lag_s)
             selected, about = select(sweep, capture, config, "probe")
             crossings = np.array([frames.crossings[k].pixel for k in selected.scans.tolist()])
@@ -206,7 +207,7 @@ def export_markerpose(config: Config, console: Console) -> None:
     """
     others = ("surface", "probe", "lag_s", "frames", "apart_s", "tissue_m_s", "masses")
     refuse_others(config, others, "of frames and networks alone")
-    if not config.data and not config.capture and config.networks is None:
+    if not (config.data or config.capture or config.networks):
         raise InputError("export: data: needs a value with layout=markerpose, or capture or networks does; give data=...")
     lines = []
     with console.status("writing"), atomic.new_folder(config.out, "export") as folder:
@@ -322,12 +323,16 @@ def select(sweep: SweepCapture, capture: Path, config: Config, purpose: Purpose)
 
 def write_networks(folder: Path, config: Config, names: Mapping[str, str]) -> list[str]:
     """Write the networks by other names, after a check of their shape; returns a line about them."""
-    if config.networks is None:
+    if not config.networks:
         return []
     from trainers import export  # torch takes seconds to import
 
     for network, name in names.items():
-        export.copy_published(config.networks / f"{network}.pt", folder / name, f"published_{network}")
+        places = [path for place in config.networks if (path := place / f"{network}.pt").exists()]
+        if len(places) != 1:
+            there = ", ".join(map(str, config.networks))
+            raise InputError(f"export: networks: expected {network}.pt in one folder of {there}, found it in {len(places)}")
+        export.copy_published(places[0], folder / name, f"published_{network}")
     return [f"networks    {', '.join(names.values())}"]
 
 
