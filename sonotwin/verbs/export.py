@@ -23,7 +23,7 @@ leave it, and results of other verbs for what a capture doesn't hold. B-scans wi
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import trimesh
@@ -64,8 +64,10 @@ from trainers import data_sets, markerpose_layout, shard_reader
 
 MEZA, SETS, MARKERPOSE = "meza2021", "us_calibration", "markerpose"
 
-MEZA_NETWORKS = {"detector": "superpoint.pt", "segmenter": "ellipsegnet.pt"}
-MARKERPOSE_NETWORKS = {"detector": "py_superpoint.pt", "segmenter": "py_ellipsegnet.pt"}
+# files of networks, as the scripts load them
+Networks = Mapping[Literal["published_detector", "published_segmenter"], str]
+MEZA_NETWORKS: Networks = {"published_detector": "superpoint.pt", "published_segmenter": "ellipsegnet.pt"}
+MARKERPOSE_NETWORKS: Networks = {"published_detector": "py_superpoint.pt", "published_segmenter": "py_ellipsegnet.pt"}
 
 
 def known_layout(name: object) -> object:
@@ -321,18 +323,19 @@ def select(sweep: SweepCapture, capture: Path, config: Config, purpose: Purpose)
     ]
 
 
-def write_networks(folder: Path, config: Config, names: Mapping[str, str]) -> list[str]:
+def write_networks(folder: Path, config: Config, names: Networks) -> list[str]:
     """Write the networks by other names, after a check of their shape; returns a line about them."""
     if not config.networks:
         return []
     from trainers import export  # torch takes seconds to import
 
     for network, name in names.items():
-        places = [path for place in config.networks if (path := place / f"{network}.pt").exists()]
+        file = f"{network.removeprefix('published_')}.pt"
+        places = [path for place in config.networks if (path := place / file).exists()]
         if len(places) != 1:
             there = ", ".join(map(str, config.networks))
-            raise InputError(f"export: networks: expected {network}.pt in one folder of {there}, found it in {len(places)}")
-        export.copy_published(places[0], folder / name, f"published_{network}")
+            raise InputError(f"export: networks: expected {file} in one folder of {there}, found it in {len(places)}")
+        export.copy_published(places[0], folder / name, network)
     return [f"networks    {', '.join(names.values())}"]
 
 

@@ -5,6 +5,7 @@ have made them. Beside the sets lie the cameras' file, `cam1_cam2.npz` or MATLAB
 The scripts read `config.yaml` in their own folder, which names all these.
 """
 
+import os
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -42,7 +43,7 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
     sizes = sizes_of(folder, sets)
     optics, about = read_cameras(folder, sizes)
     result = folder / RESULT
-    probe = probe_files.read(result, known.speed_m_s) if result.exists() else None
+    probe = probe_files.read(result, known.speed_m_s) if os.path.lexists(result) else None
 
     def fill(capture: CaptureWriter) -> list[str]:
         if optics.cameras:
@@ -101,7 +102,7 @@ def sizes_of(folder: Path, sets: dict[str, AuthorsSweep]) -> dict[str, Size]:
 
 def read_cameras(folder: Path, sizes: dict[str, Size]) -> tuple[Calibration, str]:
     """Cameras as of the first of `CAMERAS` that is there, and a line about them; none without frames of both."""
-    path = next((path for name in CAMERAS if (path := folder / name).exists()), None)
+    path = next((path for name in CAMERAS if os.path.lexists(path := folder / name)), None)
     if path is None or not {"cam1", "cam2"} <= sizes.keys():
         return Calibration({}), f"optics      none: no {' or '.join(CAMERAS)} there"
     optics = calibration_files.read(path, {device: size for device, size in sizes.items() if device != SCANNER})
