@@ -100,7 +100,8 @@ def read_by(recipe: tuple[str, ...]) -> tuple[str, ...]:
     model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
     config = load(verb, overrides, model)
     given = {override.partition("=")[0] for override in overrides} - set(WRITTEN)
-    return tuple(str(value) for name in sorted(given) if isinstance(value := getattr(config, name, None), Path))
+    values = [value if isinstance(value, list) else [value] for value in (getattr(config, name, None) for name in sorted(given))]
+    return tuple(str(path) for some in values for path in some if isinstance(path, Path))
 
 
 def without_training(verb: str) -> bool:
