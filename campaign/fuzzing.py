@@ -21,7 +21,8 @@ SPELL_S = 150  # of a process, after which another goes on with its inputs: libF
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "kalibr", "ros", "mrcal", "slstudio",
     "probe", "target", "lag", "stamps", "track", "pairs",
-    "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
+    "pose_table", "image", "mesh", "volume_nrrd", "volume_mha", "sequence", "plus_config",
+    "plus_phantom", "messages", "dicom", "video",
     "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "checkpoint", "network",
 )  # fmt: skip
 

@@ -15,6 +15,7 @@ from recon.files import atomic
 from recon.geometry import rigid
 from tests.recon.clips import made_clips
 from tests.recon.devices.openigtlink import igtl_peers
+from tests.recon.probe_calibration import test_plus_phantom
 
 LONGEST_S = 600.0
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")
@@ -24,6 +25,7 @@ MADE = (  # command lines in the order in which they are run
      "tracing.samples=4", "out=board"),
     ("render", "scene=sphere", "cameras=[cam1,cam2]", "tracing.samples=4", "out=both"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
+    ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=12", "out=rows"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
     ("sweep", "path=raster", "out=raster"),
@@ -101,6 +103,8 @@ COMMANDS = (
     Command("calibrate-probe", ("capture=wires/capture", "earlier=probe/probe.yaml"), ("wires", "probe"),
             (*_sweep("wires"), "probe/probe.yaml")),
     Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
+    Command("calibrate-probe", ("capture=rows/capture", "phantom=n_wires", "wires=fcal.xml", "lag_s=0"), ("rows", "fcal.xml"),
+            (*_sweep("rows"), "fcal.xml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
     Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
@@ -168,7 +172,7 @@ def make(folder: Path, names: Collection[str] | None = None, command: Run = comm
             outcome = command(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
-    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml")):
+    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml", "fcal.xml")):
         _write_others(folder)
 
 
@@ -198,6 +202,7 @@ def _write_others(folder: Path) -> None:
     (folder / "pairs.csv").write_text(_pairs(folder), encoding="utf-8")
     _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
+    (folder / "fcal.xml").write_text(test_plus_phantom.written(), encoding="utf-8")
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")

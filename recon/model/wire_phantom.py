@@ -6,7 +6,7 @@ wire's crossing between the sides, whatever the image's scale: so each row gives
 Source: Comeau et al. 1998; Chen et al. 2009, Ultrasound in Medicine and Biology 35(12) 2079.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,13 @@ class WirePhantom:
         reach = (other - first) @ row
         at_front, at_back = ((each - first) @ row / reach for each in (begin, end))
         return begin + ((shares - at_front) / (at_back - at_front))[..., None] * (end - begin)
+
+    def restrung(self, rows: list[int]) -> "WirePhantom":
+        """The same with the diagonals of some rows the other way: front and back exchange their places in the row."""
+        ends = self.ends.copy()
+        shift = ((ends[rows, 1, 1] - ends[rows, 1, 0]) @ self.along)[:, None] * self.along
+        ends[rows, 1] = np.stack([ends[rows, 1, 1] - shift, ends[rows, 1, 0] + shift], axis=1)
+        return replace(self, ends=ends)
 
     def shares_of_ends(self) -> Array:
         """Shares : (p, 2) of the way between the sides, at which the diagonals have their ends."""

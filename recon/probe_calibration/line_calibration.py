@@ -37,13 +37,14 @@ Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
 
 MIN_FRAMES = 8  # also of a random start: eighteen unknowns, by three numbers a frame where there is one N-wire
-DRAWS = 200  # random frames; at 20 % outliers 0.8**8 = 17 % of them are clean
-REFINED = 5  # of these starts, the best
+DRAWS = 100  # random frames; at 20 % outliers 0.8**8 = 17 % of them are clean
+REFINED = 3  # of these starts, the best
 ROUNDS = 20
 ARM_MM = 50.0  # of a registration: its standard deviation over this is that of its turns, as landmarks lie apart
 GATE = 13.8  # squared normalised residual of an outlier; exceeded by 1 of 1000 good dots (chi-square, 2)
 MEDIAN = 1.386  # of chi-square with 2 degrees of freedom
 FLOOR_MM = 1e-3  # no dot counts as more exact than this
+LEAST_SHOWN = 1e-9  # of what a further unknown changes, that no other explains: less is rounding
 HELD = 1e15  # information on unknowns that stay
 FAR_MM = 1e3  # 1 sigma of dots that are left out
 ALIKE = 1.5  # squared residuals of arrangements beside the best, of which the registration chooses
@@ -51,8 +52,9 @@ SURE = 5.0  # standard deviations from which on an unusual value is told
 SAME_SIZE = 0.005  # of a phantom, and its definition
 MAX_SIZE = 0.03  # beyond which it is another phantom
 NO_LAG_S = 0.005  # lag that isn't worth a word
-MOST_TRIED = 40  # frames, of a refusal
-UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4, "micrometres": 1e-3}  # mm
+MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
+MOST_TRIED, DRAWS_TRIED = 24, 20  # frames and random starts, of a refusal
+UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
 FLAT_MM = 1.0  # rms of the middle dots' places out of a plane, below which they are of one row
 
 
@@ -269,18 +271,18 @@ def _transforms(turns: Array, shifts: Array) -> Array:
     return result
 
 
-def robust_start(problem: Problem, rng: np.random.Generator) -> Estimate:
+def robust_start(problem: Problem, rng: np.random.Generator, count: int = DRAWS, refined: int = REFINED) -> Estimate:
     """Least median of squares over closed forms: of all frames, and of random ones. The best few are refined first."""
     phantom, frames = problem.phantom, problem.frames
     n = len(frames.poses)
-    draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
+    draws = np.argsort(rng.random((count, n)), axis=1)[:, :MIN_FRAMES]
     whole = [each[None] for each in closed_form(phantom, frames.poses, frames.pixels)]
     drawn = closed_form(phantom, frames.poses[draws], frames.pixels[draws])
     starts = [np.concatenate(pair) for pair in zip(whole[:3], drawn[:3], strict=True)]
     beside = np.zeros((phantom.count, 2))
     estimates = [Estimate(pose, scale, world, beside) for pose, scale, world in zip(*starts, strict=True)]
     medians = [np.median((residuals(each, problem) ** 2).sum(axis=-1)) for each in estimates]
-    best = [_refined_on_half(estimates[k], problem) for k in np.argsort(medians)[:REFINED]]
+    best = [_refined_on_half(estimates[k], problem) for k in np.argsort(medians)[:refined]]
     return min(best, key=lambda each: np.median((residuals(each, problem) ** 2).sum(axis=-1)))
 
 
@@ -448,6 +450,9 @@ class LineAdjustment:
                     f"the phantom lies {turn:.1f} deg and {shift:.1f} mm from its registration: moved since, registered in "
                     "another reference frame, or poses of another unit? registration=free does without"
                 )
+        for k in np.flatnonzero(self.inliers.mean(axis=0) < MIN_INLIERS):
+            share = 100 * (1 - self.inliers[:, k].mean())
+            yield f"{share:.0f} % of the dots of wire {self.wires.phantom.names[k]} lie elsewhere: is it strung as defined?"
         size, sigma = self.size
         if abs(size - 1) > max(SURE * sigma, SAME_SIZE):
             yield f"by the poses the phantom is {100 * (size - 1):+.1f} ± {100 * sigma:.1f} % larger than its definition"
@@ -499,7 +504,8 @@ def calibrate(
     problem, start = arranged(sightings, wires, noise or Noise(), rng)
     found = without_outliers(start, problem)
     rms = _rms(residuals(found.estimate, problem)[found.inliers])
-    if found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS:
+    astray = (found.inliers.mean(axis=0) < MIN_INLIERS).sum()
+    if found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS or astray > MOST_ASTRAY:
         _say_why(problem, found, rms, numbers)
     several = np.repeat(problem.frames.poses, problem.phantom.count, axis=0), problem.frames.pixels.reshape(-1, 2)
     if wires.registration is None:
@@ -607,7 +613,9 @@ def _by_column(problem: Problem, found: Fit, column: Array) -> tuple[Array, floa
     change = -spread @ (flat.T @ more)
     free = more + flat @ change
     information = float(more @ free)
-    return change, -float(free @ rest) / max(information, 1e-300), 1 / np.sqrt(max(information, 1e-300))
+    if information < LEAST_SHOWN * float(more @ more):
+        return change, 0.0, np.inf
+    return change, -float(free @ rest) / information, 1 / np.sqrt(information)
 
 
 def _size(problem: Problem, found: Fit) -> tuple[float, float]:
@@ -679,21 +687,19 @@ def _say_why(problem: Problem, found: Fit, rms: float, numbers: NDArray[np.int64
     some = np.unique(np.linspace(0, len(found.inliers) - 1, MOST_TRIED).astype(int))
     few, misfits = problem.of(some), {}
     for meaning, other in _readings(few):
-        start = robust_start(other, np.random.default_rng(0))
+        start = robust_start(other, np.random.default_rng(0), DRAWS_TRIED, refined=1)
         misfits[meaning] = float(np.sqrt(np.median((residuals(start, other) ** 2).sum(axis=-1))))
     likely = min(misfits, key=lambda meaning: misfits[meaning], default="")
-    if likely and misfits[likely] < min(rms / 2, MAX_RMS_MM):
+    if likely and misfits[likely] < min(_rms(residuals(found.estimate, problem)) / 2, MAX_RMS_MM):
         raise InputError(f"dots: expected on the wires of a phantom at rest, found {likely}: read so, they are")
     away = np.sqrt((residuals(found.estimate, problem) ** 2).sum(axis=-1).mean(axis=1))
     names = np.arange(len(away)) if numbers is None else numbers
     farthest = ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
-    few_dots = f"only {100 * found.inliers.mean():.0f} % of the dots that agree"
-    found_ = (
-        few_dots
-        if found.inliers.mean() < MIN_INLIERS
-        else f"residuals of {rms:.1f} mm (rms), {found.level:.1f} times the assumed noise"
+    agree = 100 * found.inliers.mean()
+    noise = (
+        f"residuals of {rms:.1f} mm (rms), {found.level:.1f} times the assumed noise, of the {agree:.0f} % of the dots that agree"
     )
-    raise InputError(f"dots: expected on the wires of a phantom at rest, found {found_}; farthest off: {farthest}")
+    raise InputError(f"dots: expected on the wires of a phantom at rest, found {noise}; farthest off: {farthest}")
 
 
 def _readings(problem: Problem) -> Iterator[tuple[str, Problem]]:
@@ -708,8 +714,6 @@ def _readings(problem: Problem) -> Iterator[tuple[str, Problem]]:
         yield f"poses in {unit}", replace(free, frames=replace(frames, poses=poses))
     rows = range(len(phantom.ends))
     for reversed_ in dict.fromkeys([*((row,) for row in rows), tuple(rows)]):
-        ends = phantom.ends.copy()
-        ends[list(reversed_), 1] = ends[list(reversed_), 1, ::-1]
         which = f"N-wire {reversed_[0] + 1}" if len(reversed_) == 1 else "all N-wires"
-        other = replace(phantom, ends=ends)
+        other = phantom.restrung(list(reversed_))
         yield f"front and back exchanged of the diagonal of {which}", replace(free, wires=replace(free.wires, phantom=other))

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model.wire_phantom import WirePhantom
-from recon.probe_calibration.cross_wire import SEVERAL, Appearance
+from recon.probe_calibration.cross_wire import FACE_PERCENT, SEVERAL, Appearance
 
 Array = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ APART_PX = (25, 13)  # no second dot within half of this
 NOISE = 6.0  # least height of an echo, in units of the noise
 NO_ROW, UNLIKE = "no dots in a row of three", "no rows as the phantom's"  # reasons of a rejection
 SPARE = 8  # echoes looked at beyond the phantom's wires, the brightest
+TAIL_PX, TAIL_DB = (15.0, 25.0), 6.0  # place of a tail beside and below its echo, at most, and least difference of both
+SLOPE_DB = 2.0  # by which an echo may rise beside its highest point, as such rows make it
 CORE_DB = 8.0  # an echo's part of which the centre counts
 RAGGED = 0.1  # standard deviation of a dot's centre, of its extent: echoes of oblique wires are uneven
 FLOOR_PX = 0.3  # no dot counts as more exact than this
@@ -101,8 +103,9 @@ def short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> Ech
     """Short bright echoes in a B-scan : (h, w), with their centres: the mean of their cores, weighted by level."""
     grey = 255 / look.dynamic_range_db  # levels a dB
     smooth = cv2.GaussianBlur(level, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1], borderType=cv2.BORDER_REPLICATE)
-    relief = smooth - np.median(smooth, axis=1, keepdims=True)
-    noise = NORMAL_MAD * np.median(np.abs(relief - np.median(relief)))
+    relief = smooth - np.percentile(smooth, FACE_PERCENT, axis=1, keepdims=True)  # rows bright along the whole array are no dots
+    relief -= np.median(relief)
+    noise = NORMAL_MAD * np.median(np.abs(relief))
     threshold = max(NOISE * noise, look.min_contrast_db * grey)
     around = cv2.dilate(relief, np.ones((APART_PX[1], APART_PX[0]), np.uint8))
     v, u = np.nonzero((relief >= around) & (relief > threshold))
@@ -113,11 +116,19 @@ def short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> Ech
         if len(centres) == most:
             break
         measured = _centre(smooth, (int(u[k]), int(v[k])), grey, look)
-        if measured is not None:
+        if measured is not None and not _is_tail(measured[0], relief[v[k], u[k]] / grey, centres, contrasts):
             centres.append(measured[0])
             covariance.append(measured[1])
             contrasts.append(relief[v[k], u[k]] / grey)
     return Echoes(np.reshape(centres, (-1, 2)), np.reshape(covariance, (-1, 2, 2)), np.array(contrasts, float))
+
+
+def _is_tail(centre: Array, contrast_db: float, brighter: list[Array], their_db: list[float]) -> bool:
+    """Whether an echo is the comet tail of one close above it, which is brighter by some dB."""
+    return any(
+        abs(centre[0] - each[0]) <= TAIL_PX[0] and 0 < centre[1] - each[1] <= TAIL_PX[1] and contrast_db < db - TAIL_DB
+        for each, db in zip(brighter, their_db, strict=True)
+    )
 
 
 def _centre(smooth: NDArray[np.float32], peak: tuple[int, int], grey: float, look: Appearance) -> tuple[Array, Array] | None:
@@ -129,6 +140,8 @@ def _centre(smooth: NDArray[np.float32], peak: tuple[int, int], grey: float, loo
     edge = smooth[v, u] - CORE_DB * grey
     labels, _ = ndimage.label(window > edge)
     rows, columns = np.nonzero(labels == labels[v - top, u - left])
+    if window[rows, columns].max() > smooth[v, u] + SLOPE_DB * grey:
+        return None  # on the slope of a brighter one
     if np.ptp(columns) + 1 > look.max_extent_px[0] or np.ptp(rows) + 1 > look.max_extent_px[1]:
         return None
     height, width = smooth.shape
