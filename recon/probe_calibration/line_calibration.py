@@ -55,7 +55,7 @@ NO_LAG_S = 0.005  # lag that isn't worth a word
 MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
 MOST_TRIED, DRAWS_TRIED = 24, 20  # frames and random starts, of a refusal
 UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
-FLAT_MM = 1.0  # rms of the middle dots' places out of a plane, below which they are of one row
+FLAT_MM = 1.0  # depth of all rows, below which there is but one
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class DotSightings:
 
 
 @dataclass(frozen=True)
-class Frames:
+class _Frames:
     """The dots of k wires in n frames, each known to be of its wire."""
 
     poses: Array  # (n, 4, 4) world_from_target, mm
@@ -80,10 +80,10 @@ class Frames:
     pose_covariance: Array | None = None  # (n, 6, 6)
     pose_rates: Array | None = None  # (n, 4, 4)
 
-    def of(self, chosen: NDArray) -> "Frames":
+    def of(self, chosen: NDArray) -> "_Frames":
         """Some of them, by number or mask."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Frames(**{name: None if value is None else value[chosen] for name, value in values.items()})
+        return _Frames(**{name: None if value is None else value[chosen] for name, value in values.items()})
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Wires:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class _Estimate:
     """The unknowns."""
 
     target_from_image: Array  # (4, 4)
@@ -119,33 +119,33 @@ class Estimate:
     world_from_phantom: Array  # (4, 4)
     beside: Array  # (k, 2) mm, of the wires from their places, in the plane across each
 
-    def moved(self, step: Step) -> "Estimate":
+    def moved(self, step: Step) -> "_Estimate":
         """After a step of `unknowns`."""
-        scale, probe, phantom, wires = unknowns(len(self.beside)).split(step.shared)
-        return Estimate(
+        scale, probe, phantom, wires = _unknowns(len(self.beside)).split(step.shared)
+        return _Estimate(
             rigid.moved(self.target_from_image, probe),
             self.scale + scale,
             rigid.moved(self.world_from_phantom, phantom),
             self.beside + wires.reshape(-1, 2),
         )
 
-    def arms(self, frames: Frames) -> Array:
+    def arms(self, frames: _Frames) -> Array:
         """Vectors : (n, k, 3) mm, along the world's axes, from the target's origin to the dots."""
         plane = (frames.pixels * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
         return plane @ np.swapaxes(frames.poses[:, :3, :3], 1, 2)
 
-    def in_phantom(self, frames: Frames) -> Array:
+    def in_phantom(self, frames: _Frames) -> Array:
         """Places : (n, k, 3) mm of the dots in the phantom's frame."""
         world = self.arms(frames) + frames.poses[:, None, :3, 3]
         return rigid.apply(rigid.invert(self.world_from_phantom), world)
 
 
 @dataclass(frozen=True)
-class Problem:
+class _Problem:
     """What an adjustment of n frames is made of."""
 
     wires: Wires
-    frames: Frames
+    frames: _Frames
     noise: Noise
     held: Mask | None = None  # (g,) unknowns that stay as they are
 
@@ -157,16 +157,16 @@ class Problem:
     @property
     def known(self) -> Array:
         """Information : (g,) on the unknowns beforehand."""
-        blocks = unknowns(self.phantom.count)
+        blocks = _unknowns(self.phantom.count)
         known = np.zeros(len(blocks))
         known[blocks["wires"]] = self.wires.place_sigma_mm**-2
         if self.wires.registration is not None:
             known[blocks["phantom"]] = self.wires.registration.sigma**-2
         return known
 
-    def departures(self, estimate: Estimate) -> Array:
+    def departures(self, estimate: _Estimate) -> Array:
         """Differences : (g,) of an estimate from what is known."""
-        blocks = unknowns(self.phantom.count)
+        blocks = _unknowns(self.phantom.count)
         departures = np.zeros(len(blocks))
         departures[blocks["wires"]] = estimate.beside.ravel()
         if self.wires.registration is not None:
@@ -175,26 +175,26 @@ class Problem:
             )
         return departures
 
-    def of(self, chosen: NDArray) -> "Problem":
+    def of(self, chosen: NDArray) -> "_Problem":
         """By some of the frames."""
         return replace(self, frames=self.frames.of(chosen))
 
 
 @dataclass(frozen=True)
-class Fit:
+class _Fit:
     """An adjustment, and the dots that it is made of."""
 
-    estimate: Estimate
+    estimate: _Estimate
     inliers: Mask  # (n, k) dots
     level: float  # measured noise over the assumed
 
 
-def unknowns(wires: int) -> Blocks:
+def _unknowns(wires: int) -> Blocks:
     """Of the adjustment by some wires; the first as `recon.model.probe.NAMES`."""
     return Blocks({"scale": 2, "probe": 6, "phantom": 6, "wires": 2 * wires})
 
 
-def across(directions: Array) -> Array:
+def _across(directions: Array) -> Array:
     """Orthonormal vectors : (k, 2, 3) across unit vectors : (k, 3)."""
     least = np.eye(3)[np.abs(directions).argmin(axis=1)]
     first = np.cross(directions, least)
@@ -202,18 +202,17 @@ def across(directions: Array) -> Array:
     return np.stack([first, np.cross(directions, first)], axis=1)
 
 
-def residuals(estimate: Estimate, problem: Problem) -> Array:
+def _residuals(estimate: _Estimate, problem: _Problem) -> Array:
     """Distances : (n, k, 2) mm of the dots from their wires, in the plane across each."""
     offsets = estimate.in_phantom(problem.frames) - problem.phantom.points
-    return np.einsum("kij,nkj->nki", across(problem.phantom.directions), offsets) - estimate.beside
+    return np.einsum("kij,nkj->nki", _across(problem.phantom.directions), offsets) - estimate.beside
 
 
-def closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Array, Array, Array, Array]:
+def _closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
     """Least squares without iteration by the middle dots alone, for any number of sets of frames at once.
 
     `R_i (u a + v b + t) + t_i = Q p + q` is linear in a = sx x, b = sy y, t, and in the phantom's Q and q: p is the point of the
-    diagonal that the dots of its row give. The lengths of a and b are the scales, those of Q the size of the phantom beside that
-    of the poses; the rotations are the nearest.
+    diagonal that the dots of its row give. The lengths of a and b are the scales; the rotations are the nearest.
 
     Parameters
     ----------
@@ -221,7 +220,7 @@ def closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Arra
 
     Returns
     -------
-    target_from_image, scale, world_from_phantom, size : (..., 4, 4), (..., 2), (..., 4, 4), (...)
+    target_from_image, scale, world_from_phantom : (..., 4, 4), (..., 2), (..., 4, 4)
     """
     rows = pixels.reshape(*pixels.shape[:-2], -1, 3, 2)
     length = rows[..., 2, :] - rows[..., 0, :]
@@ -246,14 +245,9 @@ def closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Arra
     scale = np.maximum(np.linalg.norm(columns, axis=-2), 1e-12)
     turned = _nearest(columns / scale[..., None, :])
     phantom_columns = np.moveaxis(solution[..., 9:-3].reshape(*solution.shape[:-1], -1, 3), -2, -1) / 10
-    size = np.linalg.norm(phantom_columns, axis=-2).mean(axis=-1)
     world = _nearest(phantom_columns)
-    return (
-        _transforms(turned, solution[..., 6:9]),
-        scale,
-        _transforms(world @ frame, solution[..., -3:] - (world @ frame @ middle)),
-        size,
-    )
+    place = solution[..., -3:] - world @ frame @ middle
+    return _transforms(turned, solution[..., 6:9]), scale, _transforms(world @ frame, place)
 
 
 def _nearest(columns: Array) -> Array:
@@ -271,39 +265,44 @@ def _transforms(turns: Array, shifts: Array) -> Array:
     return result
 
 
-def robust_start(problem: Problem, rng: np.random.Generator, count: int = DRAWS, refined: int = REFINED) -> Estimate:
+def _robust_start(problem: _Problem, rng: np.random.Generator, count: int = DRAWS, refined: int = REFINED) -> _Estimate:
     """Least median of squares over closed forms: of all frames, and of random ones. The best few are refined first."""
     phantom, frames = problem.phantom, problem.frames
     n = len(frames.poses)
     draws = np.argsort(rng.random((count, n)), axis=1)[:, :MIN_FRAMES]
-    whole = [each[None] for each in closed_form(phantom, frames.poses, frames.pixels)]
-    drawn = closed_form(phantom, frames.poses[draws], frames.pixels[draws])
-    starts = [np.concatenate(pair) for pair in zip(whole[:3], drawn[:3], strict=True)]
+    whole = [each[None] for each in _closed_form(phantom, frames.poses, frames.pixels)]
+    drawn = _closed_form(phantom, frames.poses[draws], frames.pixels[draws])
+    starts = [np.concatenate(pair) for pair in zip(whole, drawn, strict=True)]
     beside = np.zeros((phantom.count, 2))
-    estimates = [Estimate(pose, scale, world, beside) for pose, scale, world in zip(*starts, strict=True)]
-    medians = [np.median((residuals(each, problem) ** 2).sum(axis=-1)) for each in estimates]
+    estimates = [_Estimate(pose, scale, world, beside) for pose, scale, world in zip(*starts, strict=True)]
+    medians = [_median(each, problem) for each in estimates]
     best = [_refined_on_half(estimates[k], problem) for k in np.argsort(medians)[:refined]]
-    return min(best, key=lambda each: np.median((residuals(each, problem) ** 2).sum(axis=-1)))
+    return min(best, key=lambda each: _median(each, problem))
 
 
-def _refined_on_half(start: Estimate, problem: Problem) -> Estimate:
+def _median(estimate: _Estimate, problem: _Problem) -> float:
+    """Median, mm^2, of the squared distances of the dots from their wires."""
+    return float(np.median((_residuals(estimate, problem) ** 2).sum(axis=-1)))
+
+
+def _refined_on_half(start: _Estimate, problem: _Problem) -> _Estimate:
     """After two rounds of least squares on the better half of the frames."""
     keep = max(len(problem.frames.poses) // 2 + 1, MIN_FRAMES)
     for _ in range(2):
-        chosen = np.argsort(np.median((residuals(start, problem) ** 2).sum(axis=-1), axis=1))[:keep]
+        chosen = np.argsort(np.median((_residuals(start, problem) ** 2).sum(axis=-1), axis=1))[:keep]
         half = problem.of(chosen)
-        start = fit(start, half, np.ones(half.frames.pixels.shape[:2], bool))
+        start = _fit(start, half, np.ones(half.frames.pixels.shape[:2], bool))
     return start
 
 
-def covariances(estimate: Estimate, problem: Problem, inliers: Mask) -> Array:
+def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask) -> Array:
     """Of the residuals : (n, 2 k, 2 k) mm^2: the pose's, common to a frame, and in the image's axes each dot's own."""
     frames, noise = problem.frames, problem.noise
     n, k = frames.pixels.shape[:2]
     pose = frames.pose_covariance
     if pose is None:
         pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    planes = across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
+    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
     by_pose = (planes @ rigid.slopes(estimate.arms(frames))).reshape(n, 2 * k, 6)
     local = np.zeros((n, k, 3, 3))
     local[..., :2, :2] = frames.pixel_covariance * np.outer(estimate.scale, estimate.scale)
@@ -316,13 +315,13 @@ def covariances(estimate: Estimate, problem: Problem, inliers: Mask) -> Array:
     return whole
 
 
-def slopes(estimate: Estimate, problem: Problem) -> Array:
+def _slopes(estimate: _Estimate, problem: _Problem) -> Array:
     """Derivatives : (n, 2 k, g) of the residuals by the unknowns."""
     frames, phantom = problem.frames, problem.phantom
     n, k = frames.pixels.shape[:2]
-    blocks = unknowns(k)
+    blocks = _unknowns(k)
     result = np.zeros((n, k, 2, len(blocks)))
-    turned = across(phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
+    turned = _across(phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
     places = place_slopes(estimate.target_from_image, estimate.scale, frames.pixels.reshape(-1, 2)).reshape(n, k, 3, -1)
     result[..., : len(NAMES)] = turned @ (frames.poses[:, None, :3, :3] @ places)
     apart = estimate.arms(frames) + frames.poses[:, None, :3, 3] - estimate.world_from_phantom[:3, 3]
@@ -332,17 +331,17 @@ def slopes(estimate: Estimate, problem: Problem) -> Array:
     return result.reshape(n, 2 * k, len(blocks))
 
 
-def whitened(estimate: Estimate, problem: Problem, inliers: Mask, level: float) -> tuple[Array, Array]:
+def _whitened(estimate: _Estimate, problem: _Problem, inliers: Mask, level: float) -> tuple[Array, Array]:
     """Slopes : (n, 2 k, g) of the residuals and these : (n, 2 k), in standard deviations of a level of noise."""
-    left = residuals(estimate, problem).reshape(len(inliers), -1, 1)
-    both = np.concatenate([slopes(estimate, problem), left], axis=-1)
-    both = whitening(level**2 * covariances(estimate, problem, inliers)) @ both
+    left = _residuals(estimate, problem).reshape(len(inliers), -1, 1)
+    both = np.concatenate([_slopes(estimate, problem), left], axis=-1)
+    both = whitening(level**2 * _covariances(estimate, problem, inliers)) @ both
     return both[..., :-1], both[..., -1]
 
 
-def _normal_equations(estimate: Estimate, problem: Problem, inliers: Mask, level: float) -> tuple[NormalEquations, float]:
+def _normal_equations(estimate: _Estimate, problem: _Problem, inliers: Mask, level: float) -> tuple[NormalEquations, float]:
     """Normal equations and cost; no frame has unknowns of its own."""
-    by_unknowns, left = whitened(estimate, problem, inliers, level)
+    by_unknowns, left = _whitened(estimate, problem, inliers, level)
     departures = problem.departures(estimate)
     equations = NormalEquations.of_rows(by_unknowns, np.zeros((*left.shape, 0)), -left)
     equations = equations.held(np.diag(problem.known), departures)
@@ -351,39 +350,39 @@ def _normal_equations(estimate: Estimate, problem: Problem, inliers: Mask, level
     return equations, float(np.sum(left**2) + problem.known @ departures**2)
 
 
-def fit(start: Estimate, problem: Problem, inliers: Mask, level: float = 1.0) -> Estimate:
+def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0) -> _Estimate:
     """Weighted least squares on some of the dots."""
-    return descend(start, lambda estimate: _normal_equations(estimate, problem, inliers, level), Estimate.moved).estimate
+    return descend(start, lambda estimate: _normal_equations(estimate, problem, inliers, level), _Estimate.moved).estimate
 
 
-def squared(estimate: Estimate, problem: Problem) -> Array:
+def _squared(estimate: _Estimate, problem: _Problem) -> Array:
     """Squared normalised residuals : (n, k), chi-square with 2 degrees of freedom."""
-    left = residuals(estimate, problem)
+    left = _residuals(estimate, problem)
     n, k = left.shape[:2]
-    whole = covariances(estimate, problem, np.ones((n, k), bool)).reshape(n, k, 2, k, 2)
+    whole = _covariances(estimate, problem, np.ones((n, k), bool)).reshape(n, k, 2, k, 2)
     own = np.stack([whole[:, each, :, each] for each in range(k)], axis=1)
     return np.einsum("nki,nki->nk", left, np.linalg.solve(own, left[..., None])[..., 0])
 
 
-def without_outliers(start: Estimate, problem: Problem) -> Fit:
+def _without_outliers(start: _Estimate, problem: _Problem) -> _Fit:
     """Least squares on the dots within the gate, until these are the same again."""
     estimate, inliers = start, np.ones(problem.frames.pixels.shape[:2], bool)
     level, before = 1.0, None
     for _ in range(ROUNDS):
-        values = squared(estimate, problem)
+        values = _squared(estimate, problem)
         scale = np.sqrt(max(np.median(values[inliers] if before is not None else values) / MEDIAN, 1e-12))
         inliers = values <= GATE * scale**2
         if before is not None and (inliers == before).all():
             break
         before = inliers
-        estimate = fit(estimate, problem, inliers, level)
+        estimate = _fit(estimate, problem, inliers, level)
         level = _level(estimate, problem, inliers, level)
-    return Fit(fit(estimate, problem, inliers, level), inliers, level)
+    return _Fit(_fit(estimate, problem, inliers, level), inliers, level)
 
 
-def _level(estimate: Estimate, problem: Problem, inliers: Mask, level: float) -> float:
+def _level(estimate: _Estimate, problem: _Problem, inliers: Mask, level: float) -> float:
     """Measured noise over the assumed, with the freedom that what is known leaves."""
-    by_unknowns, left = whitened(estimate, problem, inliers, level)
+    by_unknowns, left = _whitened(estimate, problem, inliers, level)
     flat = by_unknowns.reshape(-1, by_unknowns.shape[-1])
     spread = inverse(flat.T @ flat + np.diag(problem.known))
     freedom = 2 * inliers.sum() - len(spread) + float(problem.known @ np.diag(spread))
@@ -501,9 +500,9 @@ def calibrate(
         raise InputError(f"sightings: expected at least {MIN_FRAMES} frames with a pose and all dots, found {count}")
     probe_checks.poses(sightings.poses)
     rng = np.random.default_rng(seed)
-    problem, start = arranged(sightings, wires, noise or Noise(), rng)
-    found = without_outliers(start, problem)
-    rms = _rms(residuals(found.estimate, problem)[found.inliers])
+    problem, start = _arranged(sightings, wires, noise or Noise(), rng)
+    found = _without_outliers(start, problem)
+    rms = _rms(_residuals(found.estimate, problem)[found.inliers])
     astray = (found.inliers.mean(axis=0) < MIN_INLIERS).sum()
     if found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS or astray > MOST_ASTRAY:
         _say_why(problem, found, rms, numbers)
@@ -521,7 +520,7 @@ def calibrate(
         by_lag = _by_column(problem, found, _lag_column(problem, found))[0][: len(NAMES)] * sightings.lag_sigma_s
         covariance += np.outer(by_lag, by_lag)
     try:
-        frames = _Frames(*several)
+        frames = _Placed(*several)
         probe_checks.certainty(estimate.target_from_image, estimate.scale, covariance, frames, size, max_sigma_mm)
     except InputError as error:
         late = "; the uncertainty of the lag is in it: hold still, or measure the lag" if sightings.lag_sigma_s else ""
@@ -536,66 +535,57 @@ def calibrate(
         wires,
         estimate.world_from_phantom,
         estimate.beside,
-        residuals(estimate, problem),
+        _residuals(estimate, problem),
         found.inliers,
-        np.sqrt(squared(estimate, problem)) / found.level,
+        np.sqrt(_squared(estimate, problem)) / found.level,
         found.level,
         sizes,
         lag,
-        _held_out(problem, found),
+        _held_out(problem, found, found.estimate),
         np.nan if earlier is None else _held_out_by(problem, found, earlier),
     )
 
 
 @dataclass(frozen=True)
-class _Frames:
+class _Placed:
     """Of dots, each with its pose, for `probe_checks`."""
 
     poses: Array  # (m, 4, 4)
     pixels: Array  # (m, 2)
 
 
-def arranged(sightings: DotSightings, wires: Wires, noise: Noise, rng: np.random.Generator) -> tuple[Problem, Estimate]:
+def _arranged(sightings: DotSightings, wires: Wires, noise: Noise, rng: np.random.Generator) -> tuple[_Problem, _Estimate]:
     """Choose an arrangement of each frame's dots, and an estimate that it agrees with.
 
-    Arrangements are of four classes: rows seen left to right or right to left, and upright or upside down. The class in which the
-    probe was held most is not known beforehand, so each is tried; then each frame takes what agrees best.
+    Arrangements are of four classes: rows seen left to right or right to left, and upright or upside down. How the probe was
+    held is not known beforehand, so each class of several frames is tried, and the likeliest of all frames where none has many;
+    then each frame takes what agrees best.
     """
-    n = len(sightings.poses)
-    right = sightings.pixels[:, :, 2, 0] > sightings.pixels[:, :, 0, 0]
-    down = sightings.pixels[:, :, -1, 1] > sightings.pixels[:, :, 0, 1]
-    there = np.isfinite(sightings.pixels).all(axis=(2, 3))
+    everywhere = np.arange(len(sightings.poses))
 
-    def problem_of(chosen: NDArray[np.int64], numbers: NDArray[np.int64]) -> Problem:
+    def problem_of(chosen: NDArray[np.int64], numbers: NDArray[np.int64] = everywhere) -> _Problem:
         picked = sightings.pixels[numbers, chosen], sightings.pixel_covariance[numbers, chosen]
         own, rates = (None if each is None else each[numbers] for each in (sightings.pose_covariance, sightings.pose_rates))
-        return Problem(wires, Frames(sightings.poses[numbers], *picked, own, rates), noise)
+        return _Problem(wires, _Frames(sightings.poses[numbers], *picked, own, rates), noise)
 
-    starts: list[tuple[float, float, Estimate]] = []
+    there = np.isfinite(sightings.pixels).all(axis=(2, 3))
+    right = sightings.pixels[:, :, 2, 0] > sightings.pixels[:, :, 0, 0]
+    down = sightings.pixels[:, :, -3, 1] >= sightings.pixels[:, :, 0, 1]
+    trials = []
     for turned, upright in product((True, False), repeat=2):
         of_class = there & (right == turned) & (down == upright)
         numbers = np.flatnonzero(of_class.any(axis=1))
         if len(numbers) >= MIN_FRAMES:
-            problem = problem_of(of_class[numbers].argmax(axis=1), numbers)
-            start = robust_start(problem, rng)
-            starts.append(
-                (
-                    np.median((residuals(start, problem) ** 2).sum(axis=-1)),
-                    float(problem.known @ problem.departures(start) ** 2),
-                    start,
-                )
-            )
-    if not starts:
-        raise InputError(f"sightings: expected {MIN_FRAMES} frames with the rows seen from one side, found fewer of each")
-    least = min(each[0] for each in starts)
-    start = min((each for each in starts if each[0] <= ALIKE * least), key=lambda each: each[1])[2]
-    everywhere = np.arange(n)
-    misfits = [
-        np.median((residuals(start, problem_of(np.full(n, each), everywhere)) ** 2).sum(axis=-1), axis=1)
-        for each in range(sightings.pixels.shape[1])
-    ]
-    chosen = np.where(there, np.transpose(misfits), np.inf).argmin(axis=1)
-    return problem_of(chosen, everywhere), start
+            trials.append(problem_of(of_class[numbers].argmax(axis=1), numbers))
+    trials = trials or [problem_of(0 * everywhere)]
+    starts = [_robust_start(each, rng) for each in trials]
+    medians = [_median(start, each) for start, each in zip(starts, trials, strict=True)]
+    likely = [k for k, median in enumerate(medians) if median <= ALIKE * min(medians)]
+    known = trials[0].known
+    start = min((starts[k] for k in likely), key=lambda each: float(known @ trials[0].departures(each) ** 2))
+    several = [problem_of(np.full(len(everywhere), each)) for each in range(there.shape[1])]
+    misfits = [np.median((_residuals(start, each) ** 2).sum(axis=-1), axis=1) for each in several]
+    return problem_of(np.where(there, np.transpose(misfits), np.inf).argmin(axis=1)), start
 
 
 def _rms(distances: Array) -> float:
@@ -603,12 +593,12 @@ def _rms(distances: Array) -> float:
     return float(np.sqrt((distances**2).sum(axis=-1).mean()))
 
 
-def _by_column(problem: Problem, found: Fit, column: Array) -> tuple[Array, float, float]:
+def _by_column(problem: _Problem, found: _Fit, column: Array) -> tuple[Array, float, float]:
     """Change : (g,) of the unknowns by one unit of a further one, whose slopes : (n, k, 2) are given; its value and its sigma."""
-    slopes_, left = whitened(found.estimate, problem, found.inliers, found.level)
-    root = whitening(found.level**2 * covariances(found.estimate, problem, found.inliers))
+    by_unknowns, left = _whitened(found.estimate, problem, found.inliers, found.level)
+    root = whitening(found.level**2 * _covariances(found.estimate, problem, found.inliers))
     more = (root @ column.reshape(*left.shape, 1))[..., 0].ravel()
-    flat, rest = slopes_.reshape(-1, slopes_.shape[-1]), left.ravel()
+    flat, rest = by_unknowns.reshape(-1, by_unknowns.shape[-1]), left.ravel()
     spread = inverse(flat.T @ flat + np.diag(problem.known))
     change = -spread @ (flat.T @ more)
     free = more + flat @ change
@@ -618,25 +608,25 @@ def _by_column(problem: Problem, found: Fit, column: Array) -> tuple[Array, floa
     return change, -float(free @ rest) / information, 1 / np.sqrt(information)
 
 
-def _size(problem: Problem, found: Fit) -> tuple[float, float]:
+def _size(problem: _Problem, found: _Fit) -> tuple[float, float]:
     """Size of the phantom beside its definition, as the motion of the probe has it, and its standard deviation."""
     middle = problem.phantom.points.mean(axis=0)
-    column = -np.einsum("kij,kj->ki", across(problem.phantom.directions), problem.phantom.points - middle)
+    column = -np.einsum("kij,kj->ki", _across(problem.phantom.directions), problem.phantom.points - middle)
     _, more, sigma = _by_column(problem, found, np.broadcast_to(column, (*found.inliers.shape, 2)))
     return 1 + more, sigma
 
 
-def _lag_column(problem: Problem, found: Fit) -> Array:
+def _lag_column(problem: _Problem, found: _Fit) -> Array:
     """Slopes : (n, k, 2) of the residuals, mm a second of lag."""
     rates, frames, estimate = problem.frames.pose_rates, problem.frames, found.estimate
     assert rates is not None
     plane = (frames.pixels * estimate.scale) @ estimate.target_from_image[:3, :2].T + estimate.target_from_image[:3, 3]
     motion = plane @ np.swapaxes(rates[:, :3, :3], 1, 2) + rates[:, None, :3, 3]
-    planes = across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T
+    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T
     return -np.einsum("kij,nkj->nki", planes, motion)
 
 
-def _more_lag(problem: Problem, found: Fit) -> tuple[float, float]:
+def _more_lag(problem: _Problem, found: _Fit) -> tuple[float, float]:
     """Lag of the B-scans that the residuals show, s, and its standard deviation; NaN without times, or at rest."""
     if problem.frames.pose_rates is None or not np.abs(problem.frames.pose_rates).any():
         return np.nan, np.nan
@@ -650,49 +640,45 @@ def pose_of(target_from_pixel: Array) -> tuple[Array, Array]:
     return rigid.nearest(rigid.transform(np.column_stack([axes, np.cross(*axes.T)]), target_from_pixel[:3, 3])), scale
 
 
-def _covariance(problem: Problem, found: Fit) -> Array:
+def _covariance(problem: _Problem, found: _Fit) -> Array:
     """Of sx, sy and the probe's pose : (8, 8), whatever phantom and wires are within what is known of them."""
-    by_unknowns, _ = whitened(found.estimate, problem, found.inliers, found.level)
+    by_unknowns, _ = _whitened(found.estimate, problem, found.inliers, found.level)
     flat = by_unknowns.reshape(-1, by_unknowns.shape[-1])
     return inverse(flat.T @ flat + np.diag(problem.known))[: len(NAMES), : len(NAMES)]
 
 
-def _held_out(problem: Problem, found: Fit) -> float:
-    """RMS, mm, of the dots of odd frames by a calibration of the even ones, and the other way round."""
-    return _halves(problem, found, found.estimate)
-
-
-def _held_out_by(problem: Problem, found: Fit, target_from_pixel: Array) -> float:
+def _held_out_by(problem: _Problem, found: _Fit, target_from_pixel: Array) -> float:
     """The same of an earlier calibration: by its registration, or else with the phantom's pose and wires adjusted as ours."""
     pose, scale = pose_of(target_from_pixel)
     earlier = replace(found.estimate, target_from_image=pose, scale=scale)
     if problem.wires.registration is not None:
         whole = replace(earlier, world_from_phantom=problem.wires.registration.world_from_phantom, beside=0 * earlier.beside)
-        return _rms(residuals(whole, problem)[found.inliers])
-    held = np.arange(len(unknowns(problem.phantom.count))) < len(NAMES)
-    return _halves(replace(problem, held=held), found, earlier)
+        return _rms(_residuals(whole, problem)[found.inliers])
+    held = np.arange(len(_unknowns(problem.phantom.count))) < len(NAMES)
+    return _held_out(replace(problem, held=held), found, earlier)
 
 
-def _halves(problem: Problem, found: Fit, start: Estimate) -> float:
+def _held_out(problem: _Problem, found: _Fit, start: _Estimate) -> float:
+    """RMS, mm, of the dots of odd frames by a calibration of the even ones, and the other way round."""
     even = np.arange(len(found.inliers)) % 2 == 0
     left = []
     for used in (even, ~even):
-        estimate = fit(start, problem.of(used), found.inliers[used], found.level)
-        left.append(residuals(estimate, problem.of(~used))[found.inliers[~used]])
+        estimate = _fit(start, problem.of(used), found.inliers[used], found.level)
+        left.append(_residuals(estimate, problem.of(~used))[found.inliers[~used]])
     return _rms(np.concatenate(left))
 
 
-def _say_why(problem: Problem, found: Fit, rms: float, numbers: NDArray[np.int64] | None) -> None:
+def _say_why(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int64] | None) -> None:
     """Refuse dots that don't lie on the wires of a phantom at rest, and name the reading under which they would."""
     some = np.unique(np.linspace(0, len(found.inliers) - 1, MOST_TRIED).astype(int))
     few, misfits = problem.of(some), {}
     for meaning, other in _readings(few):
-        start = robust_start(other, np.random.default_rng(0), DRAWS_TRIED, refined=1)
-        misfits[meaning] = float(np.sqrt(np.median((residuals(start, other) ** 2).sum(axis=-1))))
+        start = _robust_start(other, np.random.default_rng(0), DRAWS_TRIED, refined=1)
+        misfits[meaning] = float(np.sqrt(_median(start, other)))
     likely = min(misfits, key=lambda meaning: misfits[meaning], default="")
-    if likely and misfits[likely] < min(_rms(residuals(found.estimate, problem)) / 2, MAX_RMS_MM):
+    if likely and misfits[likely] < min(_rms(_residuals(found.estimate, problem)) / 2, MAX_RMS_MM):
         raise InputError(f"dots: expected on the wires of a phantom at rest, found {likely}: read so, they are")
-    away = np.sqrt((residuals(found.estimate, problem) ** 2).sum(axis=-1).mean(axis=1))
+    away = np.sqrt((_residuals(found.estimate, problem) ** 2).sum(axis=-1).mean(axis=1))
     names = np.arange(len(away)) if numbers is None else numbers
     farthest = ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
     agree = 100 * found.inliers.mean()
@@ -702,7 +688,7 @@ def _say_why(problem: Problem, found: Fit, rms: float, numbers: NDArray[np.int64
     raise InputError(f"dots: expected on the wires of a phantom at rest, found {noise}; farthest off: {farthest}")
 
 
-def _readings(problem: Problem) -> Iterator[tuple[str, Problem]]:
+def _readings(problem: _Problem) -> Iterator[tuple[str, _Problem]]:
     """Common mistakes, each with the problem as it would be without."""
     frames, phantom = problem.frames, problem.phantom
     free = replace(problem, wires=replace(problem.wires, registration=None))
