@@ -457,7 +457,8 @@ class LineAdjustment:
             yield f"by the poses the phantom is {100 * (size - 1):+.1f} ± {100 * sigma:.1f} % larger than its definition"
         lag, sigma = self.more_lag_s
         if abs(lag) > max(SURE * sigma, NO_LAG_S):
-            yield f"the B-scans are late by {1e3 * lag:.0f} ± {1e3 * sigma:.0f} ms beyond lag_s: add that to it, or hold still"
+            off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
+            yield f"the B-scans are {off} beyond lag_s: give lag_s longer by {1e3 * lag:.0f} ms, or hold still"
 
 
 def calibrate(

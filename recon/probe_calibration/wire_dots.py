@@ -68,7 +68,7 @@ class Dots:
 
 
 @dataclass(frozen=True)
-class Echoes:
+class _Echoes:
     """Short echoes in an image, the brightest first."""
 
     centres: Array  # (n, 2) px
@@ -79,16 +79,16 @@ class Echoes:
 def find(image: NDArray, phantom: WirePhantom, appearance: Appearance | None = None) -> Dots:
     """Find the dots of all wires in a B-scan : (h, w), 8-bit grey levels, log-compressed."""
     look = appearance or Appearance()
-    echoes = short_echoes(np.asarray(image, np.float32), look, phantom.count + SPARE)
+    echoes = _short_echoes(np.asarray(image, np.float32), look, phantom.count + SPARE)
     strongest = float(echoes.contrast_db.max(initial=-np.inf)) if len(echoes.centres) else np.nan
     if not len(echoes.centres):
         return _none("no echo stands out", strongest)
     if len(echoes.centres) < phantom.count:
         return _none(f"too few dots: {len(echoes.centres)} of {phantom.count} wires", strongest)
-    rows = rows_of_three(echoes.centres, phantom)
+    rows = _rows_of_three(echoes.centres, phantom)
     if not len(rows):
         return _none(NO_ROW, strongest)
-    chosen, costs = arranged(echoes, rows, phantom)
+    chosen, costs = _arranged(echoes, rows, phantom)
     if not len(chosen):
         return _none(UNLIKE, strongest)
     best = np.sort(chosen[0])
@@ -99,7 +99,7 @@ def find(image: NDArray, phantom: WirePhantom, appearance: Appearance | None = N
     return Dots(echoes.centres[kept], echoes.covariance[kept], strongest)
 
 
-def short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> Echoes:
+def _short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> _Echoes:
     """Short bright echoes in a B-scan : (h, w), with their centres: the mean of their cores, weighted by level."""
     grey = 255 / look.dynamic_range_db  # levels a dB
     smooth = cv2.GaussianBlur(level, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1], borderType=cv2.BORDER_REPLICATE)
@@ -120,7 +120,7 @@ def short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> Ech
             centres.append(measured[0])
             covariance.append(measured[1])
             contrasts.append(relief[v[k], u[k]] / grey)
-    return Echoes(np.reshape(centres, (-1, 2)), np.reshape(covariance, (-1, 2, 2)), np.array(contrasts, float))
+    return _Echoes(np.reshape(centres, (-1, 2)), np.reshape(covariance, (-1, 2, 2)), np.array(contrasts, float))
 
 
 def _is_tail(centre: Array, contrast_db: float, brighter: list[Array], their_db: list[float]) -> bool:
@@ -154,7 +154,7 @@ def _centre(smooth: NDArray[np.float32], peak: tuple[int, int], grey: float, loo
     return centre, 12 * RAGGED**2 * spread + FLOOR_PX**2 * np.eye(2)
 
 
-def rows_of_three(centres: Array, phantom: WirePhantom) -> NDArray[np.int64]:
+def _rows_of_three(centres: Array, phantom: WirePhantom) -> NDArray[np.int64]:
     """Numbers : (r, 3) of dots : (n, 2) that lie on one line, the second between the others; each row both ways."""
     n = len(centres)
     first, last = np.nonzero(~np.eye(n, dtype=bool))
@@ -171,7 +171,7 @@ def rows_of_three(centres: Array, phantom: WirePhantom) -> NDArray[np.int64]:
     return np.column_stack([first[pair], middle, last[pair]])
 
 
-def arranged(echoes: Echoes, rows: NDArray[np.int64], phantom: WirePhantom) -> tuple[NDArray[np.int64], Array]:
+def _arranged(echoes: _Echoes, rows: NDArray[np.int64], phantom: WirePhantom) -> tuple[NDArray[np.int64], Array]:
     """Dots by wire : (a, 3 p) that look as the phantom does, the likeliest first, and their costs : (a,) as squares of sigmas."""
     share, sides = _shares(echoes.centres[rows]), echoes.centres[rows[:, ::2]]
     reach = np.sort(phantom.shares_of_ends(), axis=1)
