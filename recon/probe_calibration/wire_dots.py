@@ -40,6 +40,9 @@ BEYOND = 0.08  # of a row's width, that a diagonal may be seen beyond its ends: 
 LIKELY = 12.0  # squared residuals, in sigmas, by which another arrangement of the same dots must fit worse, to be left out
 RIVAL = 3.0  # the same of other dots, within which none is chosen
 UNEVEN = 3.0  # most ratio of the image's scales along its axes, with the stretch of a tilted plane
+MOST_SETS = 5000  # rows together that are gone on with, those that fit best
+BLOCK = 500  # rows compared with all others at once
+SAME_PX = 3.0  # between centres of one echo that has two tops
 DIM_DB = 6.0  # that is as unlikely as a residual of 1 sigma
 
 
@@ -116,19 +119,21 @@ def _short_echoes(level: NDArray[np.float32], look: Appearance, most: int) -> _E
         if len(centres) == most:
             break
         measured = _centre(smooth, (int(u[k]), int(v[k])), grey, look)
-        if measured is not None and not _is_tail(measured[0], relief[v[k], u[k]] / grey, centres, contrasts):
+        if measured is not None and not _belongs(measured[0], relief[v[k], u[k]] / grey, centres, contrasts):
             centres.append(measured[0])
             covariance.append(measured[1])
             contrasts.append(relief[v[k], u[k]] / grey)
     return _Echoes(np.reshape(centres, (-1, 2)), np.reshape(covariance, (-1, 2, 2)), np.array(contrasts, float))
 
 
-def _is_tail(centre: Array, contrast_db: float, brighter: list[Array], their_db: list[float]) -> bool:
-    """Whether an echo is the comet tail of one close above it, which is brighter by some dB."""
-    return any(
-        abs(centre[0] - each[0]) <= TAIL_PX[0] and 0 < centre[1] - each[1] <= TAIL_PX[1] and contrast_db < db - TAIL_DB
-        for each, db in zip(brighter, their_db, strict=True)
-    )
+def _belongs(centre: Array, contrast_db: float, brighter: list[Array], their_db: list[float]) -> bool:
+    """Whether an echo is a second top of a brighter one, or the comet tail of one close above it that is brighter by some dB."""
+    for each, db in zip(brighter, their_db, strict=True):
+        aside, below = centre - each
+        tail = abs(aside) <= TAIL_PX[0] and 0 < below <= TAIL_PX[1] and contrast_db < db - TAIL_DB
+        if tail or np.hypot(aside, below) < SAME_PX:
+            return True
+    return False
 
 
 def _centre(smooth: NDArray[np.float32], peak: tuple[int, int], grey: float, look: Appearance) -> tuple[Array, Array] | None:
@@ -176,10 +181,13 @@ def _arranged(echoes: _Echoes, rows: NDArray[np.int64], phantom: WirePhantom) ->
     share, sides = _shares(echoes.centres[rows]), echoes.centres[rows[:, ::2]]
     reach = np.sort(phantom.shares_of_ends(), axis=1)
     fit = [np.flatnonzero((share > low - BEYOND) & (share < high + BEYOND)) for low, high in reach]
+    widths, along = phantom.sections[:, 1, 0] - phantom.sections[:, 0, 0], sides[:, 1] - sides[:, 0]
     sets = fit[0][:, None]
-    for here in fit[1:]:
-        sets = np.column_stack([np.repeat(sets, len(here), axis=0), np.tile(here, len(sets))])
-        sets = sets[_misfit(sides[sets], phantom.sections[: sets.shape[1]]) < ALIKE]
+    for row, here in enumerate(fit[1:], start=1):
+        first, second = _parallel(along[sets[:, 0]] * widths[row] / widths[0], along[here])
+        sets = np.column_stack([sets[first], here[second]])
+        off = _misfit(sides[sets], phantom.sections[: row + 1])
+        sets = sets[np.argsort(off, kind="stable")[: min(MOST_SETS, int((off < ALIKE).sum()))]]
     wires = rows[sets].reshape(len(sets), phantom.count)
     distinct = (np.diff(np.sort(wires, axis=1), axis=1) > 0).all(axis=1) & _even(sides[sets], phantom.sections)
     wires, off = wires[distinct], _misfit(sides[sets[distinct]], phantom.sections)
@@ -187,6 +195,18 @@ def _arranged(echoes: _Echoes, rows: NDArray[np.int64], phantom: WirePhantom) ->
     costs = (off / SIGMA) ** 2 + dim
     order = np.argsort(costs, kind="stable")
     return wires[order], costs[order]
+
+
+def _parallel(one: Array, other: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the pairs of vectors : (n, 2) and : (m, 2) px that are nearly alike, for a part of the first at once."""
+    pairs = []
+    for begin in range(0, len(one), BLOCK):
+        some = one[begin : begin + BLOCK, None]
+        off = np.abs(some - other).max(axis=-1)
+        first, second = np.nonzero(off < 2 * ALIKE * np.linalg.norm(some, axis=-1))
+        pairs.append(np.stack([first + begin, second]))
+    first, second = np.concatenate([np.zeros((2, 0), np.int64), *pairs], axis=1)
+    return first, second
 
 
 def _shares(dots: Array) -> Array:
