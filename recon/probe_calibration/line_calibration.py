@@ -43,6 +43,7 @@ ROUNDS = 20
 ARM_MM = 50.0  # of a registration: its standard deviation over this is that of its turns, as landmarks lie apart
 GATE = 13.8  # squared normalised residual of an outlier; exceeded by 1 of 1000 good dots (chi-square, 2)
 MEDIAN = 1.386  # of chi-square with 2 degrees of freedom
+SETTLED, LEAST_LEVEL = 0.01, 1e-3  # relative change of the noise that ends the rounds, and least noise over the assumed
 FLOOR_MM = 1e-3  # no dot counts as more exact than this
 LEAST_SHOWN = 1e-9  # of what a further unknown changes, that no other explains: less is rounding
 HELD = 1e15  # information on unknowns that stay
@@ -295,8 +296,11 @@ def _refined_on_half(start: _Estimate, problem: _Problem) -> _Estimate:
     return start
 
 
-def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask) -> Array:
-    """Of the residuals : (n, 2 k, 2 k) mm^2: the pose's, common to a frame, and in the image's axes each dot's own."""
+def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask, level: float) -> Array:
+    """Of the residuals : (n, 2 k, 2 k) mm^2: the pose's, common to a frame, and in the image's axes each dot's own.
+
+    A level of noise below 1 is that of the dots: how uneven echoes are is a guess, while the tracker says how sure poses are.
+    """
     frames, noise = problem.frames, problem.noise
     n, k = frames.pixels.shape[:2]
     pose = frames.pose_covariance
@@ -308,8 +312,8 @@ def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask) -> Array
     local[..., :2, :2] = frames.pixel_covariance * np.outer(estimate.scale, estimate.scale)
     local[..., 2, 2] = noise.slice_mm**2
     by_dot = planes @ (frames.poses[:, None, :3, :3] @ estimate.target_from_image[:3, :3])
-    own = propagate(by_dot, local) + np.where(inliers, FLOOR_MM, FAR_MM)[..., None, None] ** 2 * np.eye(2)
-    whole = propagate(by_pose, pose)
+    own = level**2 * propagate(by_dot, local) + np.where(inliers, FLOOR_MM, FAR_MM)[..., None, None] ** 2 * np.eye(2)
+    whole = max(level, 1.0) ** 2 * propagate(by_pose, pose)
     for each in range(k):
         whole[:, 2 * each : 2 * each + 2, 2 * each : 2 * each + 2] += own[:, each]
     return whole
@@ -335,7 +339,7 @@ def _whitened(estimate: _Estimate, problem: _Problem, inliers: Mask, level: floa
     """Slopes : (n, 2 k, g) of the residuals and these : (n, 2 k), in standard deviations of a level of noise."""
     left = _residuals(estimate, problem).reshape(len(inliers), -1, 1)
     both = np.concatenate([_slopes(estimate, problem), left], axis=-1)
-    both = whitening(level**2 * _covariances(estimate, problem, inliers)) @ both
+    both = whitening(_covariances(estimate, problem, inliers, level)) @ both
     return both[..., :-1], both[..., -1]
 
 
@@ -355,28 +359,29 @@ def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0)
     return descend(start, lambda estimate: _normal_equations(estimate, problem, inliers, level), _Estimate.moved).estimate
 
 
-def _squared(estimate: _Estimate, problem: _Problem) -> Array:
+def _squared(estimate: _Estimate, problem: _Problem, level: float) -> Array:
     """Squared normalised residuals : (n, k), chi-square with 2 degrees of freedom."""
     left = _residuals(estimate, problem)
     n, k = left.shape[:2]
-    whole = _covariances(estimate, problem, np.ones((n, k), bool)).reshape(n, k, 2, k, 2)
+    whole = _covariances(estimate, problem, np.ones((n, k), bool), level).reshape(n, k, 2, k, 2)
     own = np.stack([whole[:, each, :, each] for each in range(k)], axis=1)
     return np.einsum("nki,nki->nk", left, np.linalg.solve(own, left[..., None])[..., 0])
 
 
 def _without_outliers(start: _Estimate, problem: _Problem) -> _Fit:
-    """Least squares on the dots within the gate, until these are the same again."""
+    """Least squares on the dots within the gate, until these are the same again, and the noise."""
     estimate, inliers = start, np.ones(problem.frames.pixels.shape[:2], bool)
-    level, before = 1.0, None
+    level, before, settled = 1.0, None, False
     for _ in range(ROUNDS):
-        values = _squared(estimate, problem)
+        values = _squared(estimate, problem, level)
         scale = np.sqrt(max(np.median(values[inliers] if before is not None else values) / MEDIAN, 1e-12))
         inliers = values <= GATE * scale**2
-        if before is not None and (inliers == before).all():
+        if before is not None and (inliers == before).all() and settled:
             break
         before = inliers
         estimate = _fit(estimate, problem, inliers, level)
-        level = _level(estimate, problem, inliers, level)
+        measured = _level(estimate, problem, inliers, level)
+        settled, level = abs(measured / level - 1) < SETTLED, measured
     return _Fit(_fit(estimate, problem, inliers, level), inliers, level)
 
 
@@ -386,7 +391,7 @@ def _level(estimate: _Estimate, problem: _Problem, inliers: Mask, level: float) 
     flat = by_unknowns.reshape(-1, by_unknowns.shape[-1])
     spread = inverse(flat.T @ flat + np.diag(problem.known))
     freedom = 2 * inliers.sum() - len(spread) + float(problem.known @ np.diag(spread))
-    return level * float(np.sqrt(max(np.sum(left**2) / max(freedom, 1.0), 1e-12)))
+    return max(level * float(np.sqrt(np.sum(left**2) / max(freedom, 1.0))), LEAST_LEVEL)
 
 
 @dataclass(frozen=True)
@@ -538,7 +543,7 @@ def calibrate(
         estimate.beside,
         _residuals(estimate, problem),
         found.inliers,
-        np.sqrt(_squared(estimate, problem)) / found.level,
+        np.sqrt(_squared(estimate, problem, found.level)),
         found.level,
         sizes,
         lag,
@@ -597,7 +602,7 @@ def _rms(distances: Array) -> float:
 def _by_column(problem: _Problem, found: _Fit, column: Array) -> tuple[Array, float, float]:
     """Change : (g,) of the unknowns by one unit of a further one, whose slopes : (n, k, 2) are given; its value and its sigma."""
     by_unknowns, left = _whitened(found.estimate, problem, found.inliers, found.level)
-    root = whitening(found.level**2 * _covariances(found.estimate, problem, found.inliers))
+    root = whitening(_covariances(found.estimate, problem, found.inliers, found.level))
     more = (root @ column.reshape(*left.shape, 1))[..., 0].ravel()
     flat, rest = by_unknowns.reshape(-1, by_unknowns.shape[-1]), left.ravel()
     spread = inverse(flat.T @ flat + np.diag(problem.known))
