@@ -95,7 +95,7 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     InputError
         If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
     """
-    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker)
+    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker, settings.wires)
     atomic.check_folder(out, BY, inputs=sources)
     earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
     if settings.temperature_c is not None:

@@ -69,7 +69,7 @@ def test_a_recording_of_plus_becomes_a_calibration(registration, recording, rig,
 
 @pytest.mark.parametrize(("given", "said"), [
     (["wires=nowhere.xml"], "nowhere.xml: expected a configuration of the PLUS toolkit, found none"),
-    (["registration=known"], "registration: expected PhantomToTracker in wires=, as it is known, found none"),
+    (["registration=known"], "registration: expected PhantomToTracker in wires=, found none; registration=free needs none"),
     (["phantom=crossed_wires", "wires=fcal.xml"], "wires: expected none with phantom=crossed_wires, found fcal.xml"),
     (["wires=other.xml"], "is wires= the definition of this phantom"),
     (["wires=metres.xml"], "metres.xml: N-wire 1 (0:0, 0:1, 0:2): expected a wire of 5 to 500 mm, found 0.04 mm: another unit?"),

@@ -33,8 +33,8 @@ def read(settings: Settings, reference: str | None) -> PlusPhantom:
     """The wires of a configuration, without its registration where that is to be found."""
     phantom = plus_phantom.FCAL if settings.wires is None else plus_phantom.read(settings.wires, reference)
     if settings.registration == "known" and phantom.reference_from_phantom is None:
-        where = "of a sequence" if reference is None else f"PhantomTo{reference} in wires="
-        raise InputError(f"registration: expected {where}, as it is known, found none; registration=free needs none")
+        where = "a sequence, for whose frames wires= has it" if reference is None else f"PhantomTo{reference} in wires="
+        raise InputError(f"registration: expected {where}, found none; registration=free needs none")
     free = settings.registration == "free"
     return PlusPhantom(phantom.wires, phantom.name, None, phantom.target_from_pixel) if free else phantom
 
