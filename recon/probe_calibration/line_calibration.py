@@ -463,7 +463,7 @@ class LineAdjustment:
         lag, sigma = self.more_lag_s
         if abs(lag) > max(SURE * sigma, NO_LAG_S):
             off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
-            yield f"the B-scans are {off} beyond lag_s: give lag_s longer by {1e3 * lag:.0f} ms, or hold still"
+            yield f"the B-scans are {off} beyond lag_s: add {lag:+.3f} to it, or hold still"
 
 
 def calibrate(
