@@ -22,7 +22,7 @@ NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "kalibr", "ros", "mrcal", "slstudio",
     "probe", "target", "tip", "lag", "stamps", "track", "authors_poses", "pairs",
     "pose_table", "image", "mesh", "model_stl", "model_glb",
-    "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
+    "volume_nrrd", "volume_mha", "sequence", "plus_config", "plus_phantom", "messages", "dicom", "video",
     "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "centres", "checkpoint", "network",
 )  # fmt: skip
 

@@ -24,6 +24,7 @@ from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences
 from recon.model.rig import Target
+from recon.probe_calibration import plus_phantom
 from recon.rig_check import check_log
 from recon.skin_projection import planned_cut
 from recon.tracking import networks
@@ -97,6 +98,7 @@ READERS = {
     "volume_mha": Reader(volumes.read_volume, ("small.mha",), "file.mha"),
     "sequence": Reader(_sequence, ("small.igs.mha",), "file.igs.mha"),
     "plus_config": Reader(plus_config.read_config, ("plus.xml",)),
+    "plus_phantom": Reader(lambda path: plus_phantom.read(path, "Reference"), ("fcal.xml",)),
     "messages": Reader(_messages, ("small.igtl",), "file.igtl"),
     "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
     "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),

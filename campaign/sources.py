@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.model.tip import Tip
 from tests.recon.clips import made_clips
 from tests.recon.devices.openigtlink import igtl_peers
+from tests.recon.probe_calibration import test_plus_phantom
 from tests.recon.tip_calibration import pivot_films
 
 LONGEST_S = 600.0
@@ -26,6 +27,7 @@ MADE = (  # command lines in the order in which they are run
      "tracing.samples=4", "out=board"),
     ("render", "scene=sphere", "cameras=[cam1,cam2]", "tracing.samples=4", "out=both"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
+    ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=12", "out=rows"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
     ("sweep", "path=raster", "out=raster"),
@@ -107,6 +109,8 @@ COMMANDS = (
     Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
     Command("calibrate-probe", ("runs=[noisy_pairs.csv,probe]",), ("noisy_pairs.csv", "probe"),
             ("noisy_pairs.csv", "probe/probe.yaml")),
+    Command("calibrate-probe", ("capture=rows/capture", "phantom=n_wires", "wires=fcal.xml", "lag_s=0"), ("rows", "fcal.xml"),
+            (*_sweep("rows"), "fcal.xml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
@@ -187,7 +191,7 @@ def make(folder: Path, names: Collection[str] | None = None, command: Run = comm
             outcome = command(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
-    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml")):
+    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml", "fcal.xml")):
         _write_others(folder)
 
 
@@ -218,6 +222,7 @@ def _write_others(folder: Path) -> None:
     (folder / "noisy_pairs.csv").write_text(_pairs(folder, noise_px=0.3), encoding="utf-8")
     _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
+    (folder / "fcal.xml").write_text(test_plus_phantom.written(), encoding="utf-8")
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     _write_tool(folder)

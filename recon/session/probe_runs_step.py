@@ -18,8 +18,8 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration, place_slopes
 from recon.model.rig import Probe
 from recon.probe_calibration import (
-    crossing_frames,
     movement,
+    phantom_frames,
     point_calibration,
     probe_checks,
     probe_figures,
@@ -109,6 +109,11 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
         twice = next(sources[k] for k, place in enumerate(places) if place in places[:k])
         raise InputError(f"runs: expected each once, found {name_of(*twice)} twice: its repeatability would be 0")
     design = settings.rig.probe
+    if settings.phantom != phantom_frames.CROSSED_WIRES and (filmed := [one for one in sources if not _is_result(one[0])]):
+        expected = f"results of before, as {settings.phantom} shows no one point whose scatter is held out"
+        raise InputError(
+            f"runs: expected {expected}, found {name_of(*filmed[0])}: calibrate by each, and give the folders written"
+        )
     if any((path / MANIFEST).is_file() for path, _ in sources):
         probe_step.say_assumed(settings, watch)
     for path, sweep in sources:
@@ -118,7 +123,7 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
             lag = settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma
             frames = replace(probe_step.look(opened, settings, *lag), name=name)
         elif path.suffix.lower() == ".csv":
-            frames = crossing_frames.of_pairs(name, design.image_size, *sweep_tables.read_pairs(path))
+            frames = phantom_frames.of_pairs(name, design.image_size, *sweep_tables.read_pairs(path))
         else:
             yield Run(name, probe_files.read(path))
             continue
@@ -127,6 +132,10 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
             if line.startswith("warning"):
                 watch.say(f"{line} ({name})")
         yield Run(name, found.result.calibration, found)
+
+
+def _is_result(path: Path) -> bool:
+    return not (path / MANIFEST).is_file() and path.suffix.lower() != ".csv"
 
 
 def sources_of(path: Path) -> list[tuple[Path, str]]:
