@@ -182,7 +182,7 @@ def export_sets(config: Config, console: Console) -> None:
                 raise InputError(f"{capture}: expected B-scans of {expected} px, as of {config.capture[0]}, found {there}")
             frames = probe_step.look(sweep, lag_s=config.lag_s)
             selected, about = select(sweep, capture, config, "probe")
-            crossings = np.array([frames.crossings[k].pixel for k in selected.scans.tolist()])
+            crossings = np.array([frames.seen[k].pixel for k in selected.scans.tolist()])
             found = np.isin(selected.scans, frames.usable)
             kept = selected.chosen(found) if found.any() else selected
             name = us_calibration.write_set(folder, number, kept.images(), kept.poses, crossings[found] if found.any() else None)
