@@ -12,6 +12,7 @@ from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker, is_beside
 from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.tracking_frames import exactly_printed, several
+from twin.shooting import FilmQuality
 
 SEED = 2047
 BODIES = (PROBE, "needle", "patient")
@@ -58,7 +59,7 @@ def alike(setup: Setup, pairs: int = 200) -> Figures:
 def searched(setup: Setup, rig: Rig, tracked: Sequence[str], pairs: int) -> Iterator[Found]:
     """Results of tracked bodies, each pair by itself, by cameras that may have drifted as usual."""
     known = nets.load(kind=rig.target.kind, by_geometry=True)
-    for take, frames in several(Setup(rig, frames=setup.frames), SEED, pairs):
+    for take, frames in several(Setup(rig, frames=setup.frames), SEED, pairs, quality=FilmQuality()):
         first, second = (device.optics.camera() for device in take.cameras)
         tracker = BodyTracker({name: Tracker((first, second), rig.targets[name], known) for name in tracked})
         for name, found in tracker.step(*frames.views).items():
