@@ -97,8 +97,10 @@ class Navigator:
         number, scan, distances = 0, None, ()
         stale_ns = 500_000_000  # beyond the lag, after which a B-scan is shown no more
         wait_s = 0.5  # for a pair of frames, until it is told that there are none
-        while not self._stopped.is_set():
+        while True:
             pair = self.pairs.take(wait_s)
+            if self._stopped.is_set():
+                return
             if pair is None:
                 self._publish(Moment(number, monotonic_ns(), None, "no frames of both cameras", troubles=self._troubles()))
                 continue
