@@ -28,7 +28,7 @@ SMALL = [  # both cameras at an eighth of their size
         (["scene=sphere", "scene.radius_mm=-3"], "radius_mm: expected greater than 0, found -3"),
         (["patterns=paper"], "patterns: expected one of"),
         (["scene=[[[]]]"], "scene: expected one of ball_bar, board, breast,"),
-        (["rig=null"], "rig: expected one of meza2021, found null; leave it out"),
+        (["rig=null"], "rig: expected one of meza2021, three_bodies, found null; leave it out"),
         (["patterns.unwrap=luck"], "patterns.unwrap: expected"),
         (["patterns.projector_size=[1920,1080]"], "patterns.projector_size: expected the rig's [1280, 800], found [1920, 1080]"),
         (["rig.projector.gama=2"], "gamma, contrast; did you mean rig.projector.gamma?"),

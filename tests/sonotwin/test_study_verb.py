@@ -172,7 +172,7 @@ SWEEP = "over={noise.speed_mm_s: [5, 10]}"
         ),
         ([*OURS, SWEEP, "rig.cam1.sensor.dark=3"], "; did you mean rig.cam1.sensor.dark_noise_e?"),
         ([*OURS, "over={noise.speed_mm_s: [5}"], "over: expected balanced brackets and quotes, found {noise.speed_mm_s: [5}"),
-        ([*OURS, SWEEP, "rig=/home/me/mine.yaml"], "meza2021, or a YAML file, found none at /home/me/mine.yaml; begin"),
+        ([*OURS, SWEEP, "rig=/home/me/mine.yaml"], "three_bodies, or a YAML file, found none at /home/me/mine.yaml; begin"),
         ([*OURS, SWEEP, "poses.count=0"], "poses.count: expected greater than or equal to 1, found 0"),
         ([*OURS, SWEEP, "search={runs: 3}"], "search.least: needs a value"),
         (
