@@ -56,7 +56,7 @@ from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camer
 
 LOOK_S = 0.2  # between two looks whether all goes on
 SEARCH_S = 0.2  # between two searches for bodies that are lost, which take as long as several pairs
-LEAST_PLAN_MM = 1.0  # from a planned path's entry to its aim
+PLAN_MM = 1.0, 1000.0  # least and most from a planned path's entry to its aim: others are in another unit
 
 
 class View(Part):
@@ -136,8 +136,9 @@ class Config(BodyFields):
     @field_validator("plan")
     @classmethod
     def _two_points(cls, given: tuple[Vector, Vector] | None) -> tuple[Vector, Vector] | None:
-        if given is not None and not np.linalg.norm(np.subtract(*given)) >= LEAST_PLAN_MM:
-            raise ValueError(f"expected an entry and an aim {LEAST_PLAN_MM:g} mm apart or more, found {[*map(list, given)]}")
+        least, most = PLAN_MM
+        if given is not None and not least <= (apart := np.linalg.norm(np.subtract(*given))) <= most:
+            raise ValueError(f"expected an entry and an aim {least:g} to {most:g} mm apart, found {apart:.3g} mm")
         return given
 
     @model_validator(mode="after")

@@ -176,8 +176,9 @@ def test_what_is_wrong_with_tools_is_said_in_one_line(complaint, tmp_path):
     assert complaint("tips.needle=a.yaml") == "tips.needle: expected none, as rig.bodies names no tool, found a.yaml"
     assert complaint(three, f"tips.needle={tmp_path / 'a.yaml'}").startswith(f"{tmp_path / 'a.yaml'}: expected")
     assert complaint("measured.needle=a.yaml").startswith("measured.needle: expected none, as rig.bodies names none")
-    apart = "navigate: plan: expected an entry and an aim 1 mm apart or more, found"
-    assert complaint("plan=[[0,0,600],[0,0,600]]").startswith(apart)
+    apart = "navigate: plan: expected an entry and an aim 1 to 1000 mm apart, found"
+    assert complaint("plan=[[0,0,600],[0,0,600]]") == f"{apart} 0 mm"
+    assert complaint("plan=[[0,0,0.6],[0.05,0,0.65]]") == f"{apart} 0.0707 mm"  # in metres
     assert complaint("plan=[[0,0,.nan],[0,0,600]]").startswith("navigate: plan.0.2: expected")
     assert complaint("plan=[[0,0,600]]").startswith("navigate: plan")
     assert complaint("alarm.path_mm=0").startswith("navigate: alarm.path_mm: expected")
