@@ -49,7 +49,7 @@ class MovingBodies:
         poses = {name: _pose_of(one, time_ns) for name, one in found.items() if one.found}
         beside = found.get(PATIENT)
         if beside is not None and not beside.found:
-            state = f"patient not found: {beside.pose.reason}; nothing is placed"
+            state = f"patient not found: {beside.pose.reason}; no body is placed"
             return Placed(None, state, tuple(self._body(name, one, None) for name, one in found.items() if name != PROBE))
         if beside is not None:
             if self.reference is None:

@@ -74,6 +74,11 @@ class Moment:
     frame_ns: int | None = None  # of camera 1's frame, by its own clock; None without frames
 
     @property
+    def places_any(self) -> bool:
+        """Whether the probe or another body is placed."""
+        return self.world_from_target is not None or any(body.world_from_body is not None for body in self.bodies)
+
+    @property
     def status(self) -> str:
         """One line for whoever watches."""
         parts = [self.state, *self.troubles]
@@ -166,7 +171,7 @@ class Outlet:
                 continue
             self.publisher.publish(moment)
             now = monotonic_ns()
-            if moment.world_from_target is not None:
+            if moment.places_any:
                 self.latencies.add(moment.exposed_ns, now)
             if moment.scan is not None and moment.scan is not shown:
                 shown = moment.scan

@@ -47,11 +47,11 @@ def test_a_patient_who_moves_with_all_changes_no_figure(mass):
     assert before.state == "target predicted"
 
 
-def test_where_the_patient_is_not_seen_nothing_is_placed(mass):
+def test_where_the_patient_is_not_seen_no_body_is_placed(mass):
     moving = MovingBodies({"needle": TIP}, {"mass0": mass}, PLAN, REFERENCE)
     placed = moving.place(three(patient=unseen()), 10**9)
     assert placed.world_from_target is None
-    assert placed.state == "patient not found: camera 1: 2 of 3 circles; nothing is placed"
+    assert placed.state == "patient not found: camera 1: 2 of 3 circles; no body is placed"
     for body in moving.measure(placed, PlacedScan(np.zeros((20, 10), np.uint8), 0, 0, PROBE)):
         assert body.world_from_body is None and body.figures is None
     assert placed.bodies[0].state == "patient not found"

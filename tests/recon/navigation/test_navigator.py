@@ -232,8 +232,11 @@ def test_tools_come_with_their_tips_beside_the_b_scan(navigate):
     assert [body.name for body in moment.bodies] == ["needle", "patient"]
     np.testing.assert_allclose(moment.bodies[0].figures.tip, rigid.apply(NEEDLE, tip.tip_mm), atol=1e-9)
     assert next(one for one in kept.moments if one.scan is not None).bodies[0].figures.plane is not None
+    tracker.hidden = ("probe",)
+    until(lambda: kept.moments[-1].world_from_target is None)
+    assert kept.moments[-1].places_any and kept.moments[-1].bodies[0].figures is not None, "a tool needs no probe"
     tracker.hidden = ("patient",)
-    until(lambda: kept.moments[-1].world_from_target is None and kept.moments[-1].scan is None)
+    until(lambda: not kept.moments[-1].places_any and kept.moments[-1].scan is None)
     assert all(body.world_from_body is None and body.figures is None for body in kept.moments[-1].bodies)
     assert kept.moments[-1].state.startswith("patient not found: camera 1: 2 of 3 circles")
 
