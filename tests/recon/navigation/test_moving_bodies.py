@@ -9,7 +9,7 @@ from recon.model.tip import Tip
 from recon.model.tracks import Track
 from recon.navigation.moving_bodies import AT_FIRST, MovingBodies
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.tool_distances import surface_of
+from recon.navigation.tool_distances import surface_of, tip_at
 from tests.recon.navigation.bodies_seen import NEEDLE, OWN, PATIENT, PROBE, SHARED, seen, three, unseen
 
 STEP = rigid.from_rotation_vector([0.03, -0.05, 0.06], [14, -9, 30])  # of the patient, and of all that is beside
@@ -75,6 +75,15 @@ def test_without_a_patient_all_stays_in_the_cameras_frame():
     (needle,) = MovingBodies({"needle": None}).measure(placed, None)
     np.testing.assert_array_equal(needle.world_from_body, NEEDLE)
     assert needle.figures is None and placed.state == "target predicted", "of a tool without a tip there is a pose alone"
+
+
+def test_the_tips_covariance_is_of_the_whole_error():
+    """By noise and by tolerances: of a drawing's tip, at the lever arm."""
+    found = {name: one for name, one in three().items() if name != "patient"}
+    moving = MovingBodies({"needle": TIP})
+    (needle,) = moving.measure(moving.place(found, 1), None)
+    _, expected = tip_at(NEEDLE, OWN + SHARED, TIP.tip_mm, TIP.covariance[:3, :3])
+    np.testing.assert_allclose(needle.figures.covariance, expected)
 
 
 def test_a_tool_that_is_not_seen_has_a_reason_and_no_figures():
