@@ -123,12 +123,8 @@ def body_from_tip(tip: Tip) -> Array:
     if tip.axis is None:
         return rigid.transform(np.eye(3), tip.tip_mm)
     z, parallel = tip.axis / np.linalg.norm(tip.axis), 1 - 1e-6  # cosine
-    if abs(z[0]) < parallel:
-        y = np.cross(z, [1.0, 0.0, 0.0])
-        y /= np.linalg.norm(y)
-    else:
-        y = np.array([0.0, 1.0, 0.0]) - z * z[1]
-        y /= np.linalg.norm(y)
+    y = np.cross(z, [1.0, 0.0, 0.0]) if abs(z[0]) < parallel else np.array([0.0, 1.0, 0.0]) - z * z[1]
+    y /= np.linalg.norm(y)
     return rigid.transform(np.column_stack([np.cross(y, z), y, z]), tip.tip_mm)
 
 

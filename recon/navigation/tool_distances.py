@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.tip import TIP, Tip
 
@@ -84,9 +85,17 @@ class TipFigures:
 
 
 def surface_of(vertices: Array, faces: NDArray[np.int64]) -> Surface:
-    """A surface of vertices : (n, 3) mm and faces : (m, 3); triangles without an area are left out."""
+    """A surface of vertices : (n, 3) mm and faces : (m, 3); triangles without an area are left out.
+
+    Raises
+    ------
+    InputError
+        If all are.
+    """
     triangles = np.asarray(vertices, float)[faces]
     triangles = triangles[trimesh.triangles.area(triangles) > 0]
+    if not len(triangles):
+        raise InputError(f"masses: expected triangles with an area, found {len(faces)} without in one of them")
     middles = triangles.mean(axis=1)
     radii = np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1)
     return Surface(triangles, middles, radii, np.array([triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))]))

@@ -170,7 +170,8 @@ def run(config: Config) -> int:
     console = LineConsole()
     sources = sources_of(config)
     probe = probe_of(config)
-    tools, plan, reference = tools_of(config), plan_of(config), reference_of(config)
+    tools, reference = tools_of(config), reference_of(config)
+    plan = None if config.plan is None else np.array(config.plan)
     tracker = tracker_of(config, sources.sizes, sources.bits)
     target = tracker.trackers[PROBE].target if isinstance(tracker, BodyTracker) else tracker.target
     with console.status("reading skin and masses"):
@@ -207,9 +208,9 @@ def publishers_of(config: Config, scene: StillScene, console: Console) -> tuple[
             stack.callback(server.close)
             told.append(f"OpenIGTLink {config.igtl.host}:{server.port}")
             slicer = [SlicerPublisher(scene, IgtlSender(server), config.alarm)]
-        view = BrowserView(scene, config.view.port, config.view.host, config.alarm)  # would print at the end of a refused run
+        view = BrowserView(scene, config.view.port, config.view.host, config.alarm)
         stack.callback(view.close)
-        record: list[Publisher] = []
+        record: list[Publisher] = []  # last, as it leaves a file
         if config.record is not None:
             record = [RecordTable(config.record, list(config.rig.bodies), list(scene.masses))]
             told.append(f"record      {config.record}")
@@ -233,11 +234,6 @@ def tools_of(config: Config) -> dict[str, Tip | None]:
             expected = f"a tool of rig.bodies, {', '.join(names)}" if names else "none, as rig.bodies names no tool"
             raise InputError(f"tips.{name}: expected {expected}, found {path}{did_you_mean(name, names)}")
     return {name: tip_files.read(config.tips[name]) if name in config.tips else None for name in names}
-
-
-def plan_of(config: Config) -> np.ndarray | None:
-    """The planned path : (2, 3) mm, its entry and its aim."""
-    return None if config.plan is None else np.array(config.plan)
 
 
 def reference_of(config: Config) -> Track | None:

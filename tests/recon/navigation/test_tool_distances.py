@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.tip import Tip
 from recon.navigation import tool_distances
@@ -76,6 +77,8 @@ def test_triangles_without_an_area_change_nothing(box):
     again = surface_of(joined, np.arange(len(joined)).reshape(-1, 3))
     assert len(again.triangles) == len(box.triangles)
     assert from_surface(POSE[:3, 3], NOISE, again).mm == pytest.approx(-HALF.min(), abs=1e-9)
+    with pytest.raises(InputError, match="masses: expected triangles with an area, found 2 without"):
+        surface_of(flat.reshape(-1, 3), np.arange(6).reshape(-1, 3))
 
 
 def test_a_tip_on_the_surface_has_a_sigma_across_it(box):
