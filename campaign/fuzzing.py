@@ -20,10 +20,10 @@ MOST_FAULTS = 5  # of one reader, after which it isn't fuzzed on
 SPELL_S = 150  # of a process, after which another goes on with its inputs: libFuzzer itself grows by some hundred bytes an input
 NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "kalibr", "ros", "mrcal", "slstudio",
-    "probe", "target", "tip", "lag", "stamps", "track", "pairs",
+    "probe", "target", "tip", "lag", "stamps", "track", "authors_poses", "pairs",
     "pose_table", "image", "mesh", "model_stl", "model_glb",
-    "volume_nrrd", "volume_mha", "sequence", "plus_config", "messages", "dicom", "video",
-    "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "checkpoint", "network",
+    "volume_nrrd", "volume_mha", "sequence", "plus_config", "plus_phantom", "messages", "dicom", "video",
+    "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "centres", "checkpoint", "network",
 )  # fmt: skip
 
 

@@ -4,7 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.capture import calibration_files, images, lag_files, manifest, probe_files, sweep_tables, target_files, tip_files
+from recon.capture import (
+    calibration_files,
+    images,
+    lag_files,
+    manifest,
+    meza2021_sweep,
+    probe_files,
+    sweep_tables,
+    target_files,
+    tip_files,
+)
 from recon.capture.surface_part import read_patterns
 from recon.clips import pose_tables
 from recon.clips.dialects import dicom_clip, video_clip
@@ -14,11 +24,12 @@ from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences
 from recon.model.rig import Target
+from recon.probe_calibration import plus_phantom
 from recon.rig_check import check_log
 from recon.skin_projection import planned_cut
 from recon.tracking import networks
 from sonotwin import config
-from trainers import export, shard_reader
+from trainers import export, markerpose_layout, shard_reader
 from twin import session
 
 
@@ -76,6 +87,7 @@ READERS = {
     "lag": Reader(lag_files.read, ("lag/lag.json",), "lag.json"),
     "stamps": Reader(sweep_tables.read_stamps, ("scan/capture/sweep/us/timestamps.csv",)),
     "track": Reader(sweep_tables.read_track, ("scan/capture/sweep/track.csv",)),
+    "authors_poses": Reader(lambda path: meza2021_sweep.read_rows(path, (4, 4)), ("sets/data1/target_pose.npy",), "file.npy"),
     "pairs": Reader(sweep_tables.read_pairs, ("pairs.csv",)),
     "pose_table": Reader(lambda path: pose_tables.read(path, COLUMNS), ("poses.csv",)),
     "image": Reader(lambda path: images.read_image(path, (321, 408), 8), ("scan/capture/sweep/us/0003.png",)),
@@ -86,6 +98,7 @@ READERS = {
     "volume_mha": Reader(volumes.read_volume, ("small.mha",), "file.mha"),
     "sequence": Reader(_sequence, ("small.igs.mha",), "file.igs.mha"),
     "plus_config": Reader(plus_config.read_config, ("plus.xml",)),
+    "plus_phantom": Reader(lambda path: plus_phantom.read(path, "Reference"), ("fcal.xml",)),
     "messages": Reader(_messages, ("small.igtl",), "file.igtl"),
     "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
     "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),
@@ -96,6 +109,7 @@ READERS = {
     "cut": Reader(planned_cut.read, ("cut.mrk.json",)),
     "points": Reader(lambda path: npz.read(path, POINTS), ("small.npz",)),
     "shard": Reader(_shard, ("data/shard-00000.tar",), "shard-00000.tar"),
+    "centres": Reader(markerpose_layout.read_table, ("markerpose/data_centers.csv",), "data_centers.csv"),
     "checkpoint": Reader(export.read_state, ("small.pt",)),
     "network": Reader(lambda path: networks.session(path, networks.SEGMENTER), ("networks/segmenter.onnx",), "file.onnx"),
 }  # fmt: skip

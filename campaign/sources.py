@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.model.tip import Tip
 from tests.recon.clips import made_clips
 from tests.recon.devices.openigtlink import igtl_peers
+from tests.recon.probe_calibration import test_plus_phantom
 from tests.recon.tip_calibration import pivot_films
 
 LONGEST_S = 600.0
@@ -26,6 +27,7 @@ MADE = (  # command lines in the order in which they are run
      "tracing.samples=4", "out=board"),
     ("render", "scene=sphere", "cameras=[cam1,cam2]", "tracing.samples=4", "out=both"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
+    ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=12", "out=rows"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
     ("sweep", "path=raster", "out=raster"),
@@ -33,6 +35,7 @@ MADE = (  # command lines in the order in which they are run
     ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
     ("dataset", "samples=4", "shard=2", "out=data"),
     ("train", "network=detector", "data=data", "steps=2", "batch=2", "crop_px=64", "out=net"),
+    ("export", "layout=markerpose", "data=data", "capture=film/capture", "out=markerpose"),
     ("surface", "capture=ball/capture", "out=skin"),
     ("calibrate-optics", "capture=board/capture", "out=optics"),
     ("calibrate-optics", "capture=board/capture", "distortion=decentred", "out=optics_of_four"),
@@ -44,6 +47,7 @@ MADE = (  # command lines in the order in which they are run
     ("segment", "capture=scan/capture", "out=masses"),
     ("calibrate-target", "capture=film/capture", "least_tilt_deg=0", "least_range_mm=0", "out=target"),
     ("export", "capture=ball/capture", "out=published"),
+    ("export", "layout=us_calibration", "capture=wires/capture", "out=sets"),
     ("check", "capture=bottom/capture", "lag=lag/lag.json", "log=rig.jsonl", "out=checked"),
     ("study", "name=sweep", "of=tracking", "film.frames=2", "over={film.rays: [16]}", "seeds=1", "out=study"),
 )  # fmt: skip
@@ -105,6 +109,8 @@ COMMANDS = (
     Command("calibrate-probe", ("pairs=pairs.csv",), ("pairs.csv",), ("pairs.csv",)),
     Command("calibrate-probe", ("runs=[noisy_pairs.csv,probe]",), ("noisy_pairs.csv", "probe"),
             ("noisy_pairs.csv", "probe/probe.yaml")),
+    Command("calibrate-probe", ("capture=rows/capture", "phantom=n_wires", "wires=fcal.xml", "lag_s=0"), ("rows", "fcal.xml"),
+            (*_sweep("rows"), "fcal.xml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
@@ -146,6 +152,10 @@ COMMANDS = (
             ("shots", "patterns.yaml", "for_slstudio"), ("for_slstudio/calibration.xml",), ("shots/0003.png",)),
     Command("import", ("folder=published",), ("published",),
             ("published/SLdata/images/3.png",)),
+    Command("export", ("layout=us_calibration", "capture=wires/capture"), ("wires",), _sweep("wires")),
+    Command("import", ("layout=us_calibration", "folder=sets"), ("sets",),
+            ("sets/data1/UScrop/US3.png",)),
+    Command("import", ("layout=stereo_basler", "folder=sets/data1"), ("sets",), ("sets/data1/UScrop/US3.png",)),
     Command("import-sweep", ("clip=scan.dcm", "poses=poses.csv", "starts_s=100", *POSES), ("scan.dcm", "poses.csv"),
             ("scan.dcm", "poses.csv")),
     Command("import-sweep", ("clip=screen.avi", "poses=poses.csv", *POSES), ("screen.avi", "poses.csv"), ("screen.avi",)),
@@ -155,6 +165,14 @@ COMMANDS = (
             ("data", "net"), ("data/shard-00001.tar", "net/detector.safetensors"), ("data/dataset.json",)),
     Command("train", ("network=detector", "data=data", "init=net/detector.pt", "steps=2", "batch=2", "crop_px=64"),
             ("data", "net"), ("net/detector.pt",)),
+    Command("train", ("network=detector", "data=markerpose", "steps=2", "batch=2", "crop_px=64"), ("markerpose",),
+            ("markerpose/data_centers.csv", "markerpose/images/im1.png")),
+    Command("train", ("network=segmenter", "data=markerpose", "steps=2", "batch=2"), ("markerpose",),
+            ("markerpose/patch120/000001.png", "markerpose/mask120/000002.png")),
+    Command("export", ("layout=markerpose", "data=data", "capture=film/capture"), ("data", "film"),
+            ("data/shard-00001.tar", *_film("film"))),
+    Command("import", ("layout=markerpose", "folder=markerpose"), ("markerpose",),
+            ("markerpose/images/L/3.png", "markerpose/StereoParams.xml")),
     Command("render", ("scene=sphere", "tracing.samples=2")),
     Command("sweep", STROKE),
     Command("film", ("frames=1",)),
@@ -176,7 +194,7 @@ def make(folder: Path, names: Collection[str] | None = None, command: Run = comm
             outcome = command(line, folder, LONGEST_S)
             if outcome.status:
                 raise RuntimeError(f"sonotwin {' '.join(line)}: {outcome.said}")
-    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml")):
+    if names is None and not all((folder / name).exists() for name in ("raster.csv", "study.yaml", "fcal.xml")):
         _write_others(folder)
 
 
@@ -207,6 +225,7 @@ def _write_others(folder: Path) -> None:
     (folder / "noisy_pairs.csv").write_text(_pairs(folder, noise_px=0.3), encoding="utf-8")
     _write_exported(folder)
     (folder / "plus.xml").write_text(PLUS, encoding="utf-8")
+    (folder / "fcal.xml").write_text(test_plus_phantom.written(), encoding="utf-8")
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     _write_tool(folder)

@@ -61,8 +61,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/probe/probe.yaml",
     },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
-    | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "probe/probe.yaml", "surface/surface.ply"}
-    | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires")},
+    | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "fcal.xml", "probe/probe.yaml", "surface/surface.ply"}
+    | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires", "rows")},
     "live.md": {"session", "morning"}
     | {f"outputs/live/{name}" for name in ("result/surface/surface.ply", "result/masses/scan", "capture/calibration/optics.yaml")}
     | {
@@ -100,7 +100,8 @@ def read_by(recipe: tuple[str, ...]) -> tuple[str, ...]:
     model = import_module(f"sonotwin.verbs.{verb.replace('-', '_')}").Config
     config = load(verb, overrides, model)
     given = {override.partition("=")[0] for override in overrides} - set(WRITTEN)
-    return tuple(str(value) for name in sorted(given) if isinstance(value := getattr(config, name, None), Path))
+    values = [value if isinstance(value, list) else [value] for value in (getattr(config, name, None) for name in sorted(given))]
+    return tuple(str(path) for some in values for path in some if isinstance(path, Path))
 
 
 def without_training(verb: str) -> bool:

@@ -13,8 +13,9 @@ from torch.utils.data import DataLoader, Dataset
 
 from recon.errors import InputError
 from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
-from trainers.labels import HIDDEN, SEEN, Labels, label_offset, labels, seen_in_view
+from trainers.labels import Labels, label_offset, labels, seen_in_view
 from trainers.shard_reader import PATCH, Data, Patches, Views
+from trainers.shard_truth import HIDDEN, SEEN
 
 TARGET_IN_CROP = 0.85  # of crops from views with a target are about it; the others are of anywhere
 COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre something was put before: neither answer is wrong

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from recon.errors import InputError, brief, reason
 from recon.files import atomic
 from recon.tracking.networks import TRAINED_FOR
+from trainers import architectures
 from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
 
@@ -66,6 +67,22 @@ def load(path: Path, network: nn.Module) -> None:
     if unknown is not None:
         raise InputError(f"{path}: expected weights of a {type(network).__name__}, found {brief(unknown)} too")
     network.load_state_dict(weights)
+
+
+def copy_published(source: Path, path: Path, name: Name) -> None:
+    """Write weights of a published network, of three circles, as .pt again, after a check.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, or of another network, with the way to such a one.
+    """
+    module = architectures.network(name, circles=3)
+    try:
+        load(source, module)
+    except InputError as error:
+        raise InputError(f"{error}; sonotwin train network={name} makes the published shape") from None
+    save(path, module)
 
 
 def check_tensors(path: Path, kind: str, found: object, expected: Mapping[Any, Tensor]) -> None:

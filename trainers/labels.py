@@ -12,9 +12,8 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
 from trainers.architectures import CELL, NO_PIXEL
+from trainers.shard_truth import HIDDEN, SEEN
 
-SEEN = 0.35  # of its disc, least that a circle is labelled with
-HIDDEN = 0.05  # of its disc, most that a circle is nothing with; in between either answer is right
 NEAR = 1.5  # px, within which a cell beyond the border knows a circle's identity too: the peak may fall there
 IGNORED = -100  # a class that doesn't count
 NONE_WEIGHT = 0.02  # of a cell without a circle, of which there are hundreds, in the loss of identity

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from trainers.architectures import NO_PIXEL
-from trainers.labels import HIDDEN, SEEN
 from trainers.shard_reader import Patches, Views
+from trainers.shard_truth import HIDDEN, SEEN
 
 Array = NDArray[np.float64]
 Metrics = dict[str, float | int]

@@ -131,6 +131,13 @@ def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, parti
     return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (circles * len(VIEWS)))
 
 
+def has_patches(folders: Sequence[Path]) -> bool:
+    """Whether the first sample of each data set has patches, or the folder no shards."""
+    firsts = (next(iter(sorted(folder.glob("*.tar"))), None) for folder in folders)
+    samples = [next(tar_members.samples(path), ("", {}))[1] for path in firsts if path is not None]
+    return all("patches1.png" in members for members in samples)
+
+
 def split(data: Some, validation: float) -> tuple[Some, Some]:
     """The first samples to train with and the last ones, a fraction `validation` and at least one, to validate with.
 
@@ -196,7 +203,8 @@ class _Index(NamedTuple):
     def images(self, which: slice, decode: Decode, size: tuple[int, int], pieces: int) -> StoredImages:
         """Images in some of the members."""
         places = self.places[:, which].reshape(-1, 3)
-        return StoredImages(self.shards, places, decode, size, pieces, np.arange(pieces * len(places)))
+        index = np.column_stack([np.repeat(np.arange(len(places)), pieces), np.tile(np.arange(pieces), len(places))])
+        return StoredImages(self.shards, places, (decode,) * len(self.shards), size, index)
 
 
 class _Shard(NamedTuple):

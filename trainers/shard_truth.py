@@ -13,6 +13,8 @@ from recon.errors import validated
 from recon.files import json_text
 from recon.geometry.pose_hypotheses import POINTS
 
+SEEN = 0.35  # of its disc, least that a circle is labelled with
+HIDDEN = 0.05  # of its disc, most that a circle is nothing with; in between either answer is right
 FARTHEST = 1e6  # px, or digital numbers: more is no measurement, and overflows in 32 bits
 
 Array = NDArray[np.float64]

@@ -1,11 +1,13 @@
-"""The sweep in the layout of the rig authors' public programs: `USdata/`, and the files of the probe's calibration.
+"""A folder of frames as the rig authors' public programs record and read it, and the files of the probe's calibration.
 
-Frame k of `L`, `R` (cameras 1 and 2), `US` (the scanner) and `USmasks` belongs together, taken at one moment; there are no time
-stamps. `target_pose.npy` holds `world_from_target` of each frame, `cross_point.npy` the pixel of the wires' crossing.
+Frame k of `L`, `R` (cameras 1 and 2), `US` or `UScrop` (the scanner) and `USmasks` belongs together, taken at one moment; there
+are no time stamps. `target_pose.npy` holds `world_from_target` of each frame, `cross_point.npy` the pixel of the wires' crossing.
 """
 
 import logging
-from collections.abc import Iterable
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +27,8 @@ Grey = NDArray[np.uint8]
 FOLDER = "USdata"
 POSES, CROSSINGS = "target_pose.npy", "cross_point.npy"
 FOLDERS = {"cam1": "L", "cam2": "R", "us": "US"}  # of each device's images
+CROPPED = "UScrop"  # of B-scans that were cut out of the scanner's screen
+NAMES = {device: f"{name}/{{}}.png" for device, name in FOLDERS.items()}  # by the frame's number
 MASKS = ("USmasks", "masks")  # folders of masks; the second in some versions of their program
 LOOSE = 0.04  # of a rotation's products: triangulated axes are off by up to 2 %
 
@@ -33,7 +37,8 @@ LOOSE = 0.04  # of a rotation's products: triangulated axes are off by up to 2 %
 class AuthorsSweep:
     """n frames of their layout; images are listed and not read yet."""
 
-    images: dict[str, list[Path]]  # device: n paths, of those that are there
+    folders: dict[str, str]  # device: name of its folder, of those that are there
+    images: dict[str, list[Path]]  # device: n paths
     sizes: dict[str, tuple[int, int]]  # width, height, px
     masks: list[Path]
     poses: Array | None  # (n, 4, 4) world_from_target, mm
@@ -45,36 +50,65 @@ class AuthorsSweep:
         return len(next(iter(self.images.values())))
 
 
-def read_sweep(folder: Path) -> AuthorsSweep | None:
-    """Read the sweep of their folder; None without one.
+def read_sweep(place: Path, scanner: Sequence[str] = (FOLDERS["us"],)) -> AuthorsSweep | None:
+    """Read a folder of frames; None if it holds none.
 
     Rotations that are off by up to 2 % are made orthonormal, with a warning.
+
+    Parameters
+    ----------
+    scanner : names that the folder of B-scans may have; the first that is there counts
 
     Raises
     ------
     InputError
-        If folders, poses or crossings are of different numbers of frames, a file is damaged, or a pose is none.
+        If folders, poses or crossings are of different numbers of frames, their files are numbered differently, one is damaged,
+        or a pose is none.
     """
-    place = Path(folder) / FOLDER
-    listed = {device: image_files(place / name) for device, name in FOLDERS.items()}
-    images = {device: paths for device, paths in listed.items() if paths}
+    names = {device: (name,) for device, name in FOLDERS.items()} | {"us": tuple(scanner)}
+    listed = {device: {name: image_files(place / name) for name in each} for device, each in names.items()}
+    folders = {device: next((name for name, paths in each.items() if paths), None) for device, each in listed.items()}
+    folders = {device: name for device, name in folders.items() if name is not None}
+    images = {device: listed[device][name] for device, name in folders.items()}
     if not images:
         return None
-    first, count = next((FOLDERS[device], len(paths)) for device, paths in images.items())
+    first, count = next((folders[device], len(paths)) for device, paths in images.items())
     masks = next((found for name in MASKS if (found := image_files(place / name))), [])
-    counts = {f"{FOLDERS[device]}/": len(paths) for device, paths in images.items()}
+    counts = {f"{folders[device]}/": len(paths) for device, paths in images.items()}
     counts |= {f"{MASKS[0]}/": len(masks)} if masks else {}
-    poses, crossings = _rows(place / POSES, (4, 4)), _rows(place / CROSSINGS, (2,))
+    poses, crossings = read_rows(place / POSES, (4, 4)), read_rows(place / CROSSINGS, (2,))
     counts |= {name: len(rows) for name, rows in ((POSES, poses), (CROSSINGS, crossings)) if rows is not None}
     for name, found in counts.items():
         if found != count:
             raise InputError(f"{place / name}: expected {count} frames, as in {first}/, found {found}")
+    _check_numbers(place, {folders[device]: paths for device, paths in images.items()})
     sizes = {device: read_grey(paths[0]).shape[::-1] for device, paths in images.items()}
-    return AuthorsSweep(images, sizes, masks, None if poses is None else _rigid(place / POSES, poses), crossings)
+    return AuthorsSweep(folders, images, sizes, masks, None if poses is None else _rigid(place / POSES, poses), crossings)
 
 
-def write_sweep(folder: Path, images: Iterable[tuple[str, int, Grey]], masks: Iterable[Grey], poses: Array) -> None:
-    """Write a sweep into a folder that is there.
+def _check_numbers(place: Path, folders: Mapping[str, Sequence[Path]]) -> None:
+    """Refuse folders with equally many images that lack different ones, by the last number in the files' names."""
+    found = {name: [re.findall(r"\d+", path.stem) for path in paths] for name, paths in folders.items()}
+    if not all(each for numbers in found.values() for each in numbers):
+        return
+    first, *others = {name: [int(each[-1]) - int(numbers[0][-1]) for each in numbers] for name, numbers in found.items()}.items()
+    for name, numbers in others:
+        if k := next((k for k, (one, other) in enumerate(zip(first[1], numbers, strict=True)) if one != other), 0):
+            one, other = folders[first[0]][k].name, folders[name][k].name
+            raise InputError(
+                f"{place / name}: expected the frame of {first[0]}/{one} next, found {other}: is one lost in between?"
+            )
+
+
+def write_sweep(
+    place: Path,
+    images: Iterable[tuple[str, int, Grey]],
+    masks: Iterable[Grey],
+    poses: Array,
+    crossings: Array | None = None,
+    names: Mapping[str, str] = NAMES,
+) -> None:
+    """Write a folder of frames.
 
     Parameters
     ----------
@@ -83,13 +117,17 @@ def write_sweep(folder: Path, images: Iterable[tuple[str, int, Grey]], masks: It
     masks : n of (h, w)
         What is shown in space; empty for none.
     poses : (n, 4, 4) mm
+    crossings : (n, 2) px; None where they are still to be found
+    names : device -> file within the folder, by the frame's number
     """
     for device, number, image in images:
-        write_images([folder / FOLDER / FOLDERS[device] / f"{number}.png"], image[None])
+        write_images([place / names[device].format(number)], image[None])
     for number, mask in enumerate(masks):
-        write_images([folder / FOLDER / MASKS[0] / f"{number}.png"], mask[None])
-    (folder / FOLDER).mkdir(exist_ok=True)
-    np.save(folder / FOLDER / POSES, poses)
+        write_images([place / MASKS[0] / f"{number}.png"], mask[None])
+    place.mkdir(exist_ok=True)
+    np.save(place / POSES, poses)
+    if crossings is not None:
+        np.save(place / CROSSINGS, crossings)
 
 
 def mended(place: str, pose: Array) -> Array:
@@ -124,9 +162,9 @@ def _rigid(path: Path, poses: Array) -> Array:
     return np.stack([rigid.nearest(pose) for pose in poses])
 
 
-def _rows(path: Path, shape: tuple[int, ...]) -> Array | None:
-    """Numbers : (n, *shape) of an npy file; None without one."""
-    if not path.exists():
+def read_rows(path: Path, shape: tuple[int, ...]) -> Array | None:
+    """Read numbers : (n, *shape) of an npy file; None without one, InputError if it is damaged or of another shape."""
+    if not os.path.lexists(path):
         return None
     rows = npz.read_npy(path)
     if rows.ndim != 1 + len(shape) or rows.shape[1:] != shape or rows.dtype.kind not in "fiu":

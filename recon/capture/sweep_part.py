@@ -35,6 +35,11 @@ class SweepCapture:
     probe: ProbeCalibration | None = None
     left_out: int = 0  # poses that no hand makes, which the track has no longer
 
+    @property
+    def clocked(self) -> bool:
+        """Whether all B-scans have a time stamp, as of any sequence that could stand in place of this."""
+        return True
+
     def image(self, number: int) -> NDArray[np.uint8]:
         """Read one B-scan : (h, w), counted from 0 whatever its frame's number; InputError if it is damaged."""
         return read_image(self.paths[number], self.size, bits=8)

@@ -63,8 +63,8 @@ def read_tracking(
         images = (lambda: (moments, small())) if "Image" in frames.valid else None
         return _without_implausible(file, of_file, names, implausible, clock, images)
 
-    own = [name for name in names if name in frames.transforms]
-    others = [name for name in names if name not in own]
+    others = [name for name in names if tracked is not None and name in tracked.transforms]
+    own = [name for name in names if name not in others]
     frames, left_out = without_implausible(path, frames, own, numbers, numbers)
     if tracker is not None and tracked is not None:
         tracked, more = without_implausible(tracker, tracked, others, tracked.times_s, times_s)
@@ -113,28 +113,28 @@ def _without_implausible(
 
 
 def _join(path: Path, frames: Frames, tracker: Path, tracked: Frames) -> Frames:
-    """The frames with the transforms of another file, between two of its rows by time; those of the first go before.
+    """The frames with the transforms of another file, between two of its rows by time; none where a frame has no time.
 
-    A transform that is the same in all rows holds always, if it is valid in all of them.
+    They replace the images' own of the same name, which recorders fill with identities. A transform that is the same in all rows
+    holds always, if it is valid in all of them.
     """
-    _check_times(path, frames.times_s)
-    moments, taken = (np.round(each * 1e9).astype(np.int64) for each in (tracked.times_s, frames.times_s))
+    timed = np.isfinite(frames.times_s)
+    _check_times(path, frames.times_s[timed] if timed.any() else frames.times_s)
+    moments, taken = (np.round(each * 1e9).astype(np.int64) for each in (tracked.times_s, np.where(timed, frames.times_s, 0)))
     transforms, valid, moving = dict(frames.transforms), dict(frames.valid), []
     for name, matrices in tracked.transforms.items():
-        if name in transforms:
-            continue
         seen, start = tracked.valid[name], np.eye(4)
         if seen.any():
             start[:3, :3] = matrices[seen.argmax(), :3, :3]  # with a scale, if it has one: without it poses are rigid
         at = tracks.at(Track(moments, np.where(seen[:, None, None], matrices, np.nan) @ np.linalg.inv(start)), taken) @ start
-        valid[name] = np.isfinite(at).all(axis=(1, 2))
+        valid[name] = np.isfinite(at).all(axis=(1, 2)) & timed
         transforms[name] = np.where(valid[name][:, None, None], at, np.eye(4))
         if _moves(matrices, seen):
             moving.append(name)
         elif seen.all():
             transforms[name], valid[name] = np.tile(matrices[0], (len(taken), 1, 1)), np.ones(len(taken), bool)
     if moving and not any(valid[name].any() for name in moving):
-        spans = [f"{times.min():.3f} to {times.max():.3f} s" for times in (tracked.times_s, frames.times_s)]
+        spans = [f"{times.min():.3f} to {times.max():.3f} s" for times in (tracked.times_s, frames.times_s[timed])]
         raise InputError(
             f"{tracker}: tracker: expected poses while the images were taken, at {spans[1]}, found some at {spans[0]}"
         )

@@ -75,6 +75,11 @@ class SequenceSweep:
         return _nanoseconds(self.name, self.times_s[self.frames])
 
     @property
+    def clocked(self) -> bool:
+        """Whether all frames have a time stamp, in order, so that poses between them are known."""
+        return bool((np.abs(self.times_s) < MOST_SECONDS).all() and (np.diff(self.times_s) >= 0).all())
+
+    @property
     def track(self) -> Track:
         """The poses of all frames with a time stamp."""
         return _track(self.name, self.times_s, self.world_from_target)

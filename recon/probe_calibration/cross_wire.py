@@ -12,7 +12,7 @@ pairs of lines the one with fewest unexplained pixels is taken, where a pixel on
 wire would be the likeliest pair.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -78,6 +78,10 @@ class Crossing:
     def found(self) -> bool:
         """Whether there is a crossing."""
         return self.reason is None
+
+    def shifted(self, corner: tuple[int, int]) -> "Crossing":
+        """The same in an image of which this one is a part, from a pixel on."""
+        return replace(self, pixel=self.pixel + corner)
 
 
 def find(image: NDArray, appearance: Appearance | None = None) -> Crossing:

@@ -20,14 +20,14 @@ for the rig of the paper:
 With the crossing at random places of the image, or with 0.3 mm of slice thickness, the corners are 50 % worse.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from recon import arguments, registry
+from recon import arguments
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
@@ -36,11 +36,10 @@ from recon.estimation.parameters import Blocks
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
-from recon.probe_calibration import movement, probe_checks, wires
+from recon.probe_calibration import cross_wire, movement, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
 from recon.probe_calibration.movement import FrameEquations, Movement
 
-PHANTOMS, CROSSED_WIRES = "recon.probe_calibration.phantoms", "crossed_wires"  # a module each; the usual one
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
@@ -117,6 +116,11 @@ class Adjustment:
     def noise_mm(self) -> float:
         """The same with the frames counted less a third of the unknowns: an estimate of the distance by noise alone."""
         return _noise_mm(self.residuals[~self.outliers], UNKNOWNS["wire"].stop + (self.apart_mm > 0))
+
+    @property
+    def distances_mm(self) -> Array:
+        """Distances : (n,) from the wire."""
+        return np.linalg.norm(self.residuals, axis=1)
 
 
 @dataclass(frozen=True)
@@ -261,11 +265,9 @@ def _noise_mm(residuals: Array, unknowns: int) -> float:
 
 
 def from_images(
-    images: Iterable[NDArray], poses: Array, appearance: Appearance | None = None, phantom: str = CROSSED_WIRES
+    images: Iterable[NDArray], poses: Array, appearance: Appearance | None = None
 ) -> tuple[Sightings, list[Crossing]]:
     """Find the crossing in B-scans : n of (h, w), tracked at poses : (n, 4, 4), NaN where the target wasn't found.
-
-    phantom : module of `recon.probe_calibration.phantoms` that finds it
 
     Returns
     -------
@@ -275,15 +277,19 @@ def from_images(
         Of all frames: the crossing, or the reason why the frame was rejected.
     """
     tracked = np.isfinite(poses).all(axis=(1, 2))
-    find = registry.kind(PHANTOMS, phantom).find
-    found = [find(image, appearance) for image in images]
+    found = [cross_wire.find(image, appearance) for image in images]
     found = [each if known else replace(each, reason=each.reason or NO_POSE) for each, known in zip(found, tracked, strict=True)]
     good = [k for k, each in enumerate(found) if each.found]
-    pixels = np.array([found[k].pixel for k in good]).reshape(-1, 2)
-    covariance = np.array([found[k].covariance for k in good]).reshape(-1, 2, 2)
+    return of_crossings([found[k] for k in good], poses[good]), found
+
+
+def of_crossings(crossings: Sequence[Crossing], poses: Array) -> Sightings:
+    """The crossing in n frames, found in each, at poses : (n, 4, 4)."""
+    pixels = np.array([each.pixel for each in crossings]).reshape(-1, 2)
+    covariance = np.array([each.covariance for each in crossings]).reshape(-1, 2, 2)
     unseen = np.full((2, 2), np.nan)
-    lines = np.array([unseen if found[k].directions is None else found[k].directions for k in good]).reshape(-1, 2, 2)
-    return Sightings(poses[good], pixels, pixel_covariance=covariance, directions=lines), found
+    lines = np.array([unseen if each.directions is None else each.directions for each in crossings]).reshape(-1, 2, 2)
+    return Sightings(poses, pixels, pixel_covariance=covariance, directions=lines)
 
 
 def closed_form(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:

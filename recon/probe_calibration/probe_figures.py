@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
+from recon import registry
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
 from recon.model.probe import NAMES, ProbeCalibration
 from recon.model.rig import Probe
-from recon.probe_calibration import crossing_frames, movement, point_calibration, probe_checks, repeatability, sound_in_water
-from recon.probe_calibration.crossing_frames import CrossingFrames
-from recon.probe_calibration.point_calibration import Adjustment
+from recon.probe_calibration import movement, phantom_frames, point_calibration, probe_checks, repeatability, sound_in_water
+from recon.probe_calibration.phantom_frames import PHANTOMS, Adjusted, PhantomFrames
 from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
@@ -24,7 +24,7 @@ SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reporte
 FREEZING_F = 32.0  # degrees Fahrenheit
 
 
-def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Settings) -> Metrics:
+def measure(frames: PhantomFrames, result: Result, design: Probe, settings: Settings) -> Metrics:
     """Figures of a calibration, each named with its unit."""
     found, calibration, uncertainty = result.adjustment, result.calibration, result.calibration.uncertainty
     assert uncertainty is not None
@@ -40,7 +40,7 @@ def measure(frames: CrossingFrames, result: Result, design: Probe, settings: Set
         "frames_used": int((~found.outliers).sum()),
         "rms_mm": found.rms_mm,
         "noise_factor": found.noise_factor,
-        "wires_apart_mm": found.apart_mm,
+        **registry.kind(PHANTOMS, frames.phantom).figures(found),
         "echo_ahead_mm": settings.echo_ahead_mm,
         "sx_mm_per_px": float(calibration.scale[0]),
         "sy_mm_per_px": float(calibration.scale[1]),
@@ -83,25 +83,24 @@ def _of_pose(calibration: ProbeCalibration) -> NDArray[np.float64]:
     return np.zeros((6, 6)) if known is None else known.ordered(NAMES)[2:, 2:]
 
 
-def describe_frames(frames: CrossingFrames, seconds: float) -> Iterator[str]:
-    """Lines: number of frames with the crossing, and reasons of the others."""
+def describe_frames(frames: PhantomFrames, seconds: float) -> Iterator[str]:
+    """Lines: number of frames with the phantom, and reasons of the others."""
     width, height = frames.size
     found, count = len(frames.usable), len(frames.numbers)
-    yield f"find        {count} frames, {width}x{height}: crossing in {found}, {count - found} rejected, {seconds:.0f} s"
-    for reason, numbers in crossing_frames.rejected(frames).items():
+    shows = registry.kind(PHANTOMS, frames.phantom).SHOWS
+    yield f"find        {count} frames, {width}x{height}: {shows} in {found}, {count - found} rejected, {seconds:.0f} s"
+    for reason, numbers in phantom_frames.rejected(frames).items():
         yield f"rejected    {len(numbers)} {reason}: frame{'s' if len(numbers) > 1 else ''} {_listed(numbers)}"
 
 
-def describe(frames: CrossingFrames, result: Result, figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
+def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Probe, settings: Settings) -> Iterator[str]:
     """Lines: agreement of the frames, the probe with its uncertainty, and the speed of sound with its effect on depths."""
     found, expected = result.adjustment, design.target_from_image.matrix()
     numbers = frames.numbers[frames.usable][found.outliers].tolist()
     left_out = f", {len(numbers)} outlier{'s' if len(numbers) > 1 else ''} left out ({_listed(numbers)})" if numbers else ""
     rms, factor = figures["rms_mm"], figures["noise_factor"]
     yield f"calibrate   {figures['frames_used']} frames{left_out}; RMS {rms:.3f} mm, noise {factor:.2f} times the assumed"
-    if found.apart_mm:
-        ahead = f"their echo taken {figures['echo_ahead_mm']:.2f} mm before their axes"
-        yield f"wires       seen as lines, the axes {found.apart_mm:.2f} mm apart; {ahead}"
+    yield from registry.kind(PHANTOMS, frames.phantom).describe(found, settings)
     scales = ", ".join(
         f"{name} {figures[f'{name}_mm_per_px']:.5f} ± {figures[f'{name}_sigma_mm_per_px']:.5f}" for name in ("sx", "sy")
     )
@@ -160,19 +159,18 @@ def _other_speed(speed: float, temperature_c: float | None) -> str:
     return "another depth setting than of rig.probe.scale_mm_per_px, or poses not in mm?"
 
 
-def rows(frames: CrossingFrames, found: Adjustment) -> Iterator[Sequence[object]]:
+def rows(frames: PhantomFrames, found: Adjusted) -> Iterator[Sequence[object]]:
     """A row a frame, in the order of COLUMNS; empty where a frame has no such value."""
     place = {int(k): m for m, k in enumerate(frames.usable)}
-    distances = np.linalg.norm(found.residuals, axis=1)
-    for k, (number, crossing) in enumerate(zip(frames.numbers.tolist(), frames.crossings, strict=True)):
-        contrast = f"{crossing.contrast_db:.1f}" if np.isfinite(crossing.contrast_db) else ""
+    for k, (number, seen) in enumerate(zip(frames.numbers.tolist(), frames.seen, strict=True)):
+        contrast = f"{seen.contrast_db:.1f}" if np.isfinite(seen.contrast_db) else ""
         if k not in place:
-            yield number, "rejected", "", "", contrast, "", "", crossing.reason
+            yield number, "rejected", "", "", contrast, "", "", seen.reason
             continue
         m = place[k]
         status = "outlier" if found.outliers[m] else "used"
-        pixel = [f"{value:.3f}" for value in crossing.pixel]
-        yield number, status, *pixel, contrast, f"{distances[m]:.4f}", f"{found.normalised[m]:.3f}", ""
+        pixel = [f"{value:.3f}" for value in seen.pixel]
+        yield number, status, *pixel, contrast, f"{found.distances_mm[m]:.4f}", f"{found.normalised[m]:.3f}", ""
 
 
 def _listed(numbers: Sequence[int], most: int = 10) -> str:

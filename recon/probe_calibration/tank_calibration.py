@@ -1,9 +1,10 @@
-"""Calibration of the probe by crossed wires in a tank of water, for the medium of later sweeps."""
+"""Calibration of the probe by a phantom in a tank of water, for the medium of later sweeps."""
 
 import dataclasses
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, PlainValidator, field_validator, model_validator
@@ -12,12 +13,12 @@ from recon import registry
 from recon.errors import InputError
 from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Probe
-from recon.probe_calibration import point_calibration, probe_checks, sound_in_water, wires
+from recon.probe_calibration import probe_checks, sound_in_water, wires
 from recon.probe_calibration.cross_wire import Appearance
-from recon.probe_calibration.crossing_frames import CrossingFrames
-from recon.probe_calibration.point_calibration import Adjustment, Noise
+from recon.probe_calibration.phantom_frames import CROSSED_WIRES, PHANTOMS, Adjusted, PhantomFrames
+from recon.probe_calibration.point_calibration import Noise
 
-Phantom = Annotated[str, PlainValidator(partial(registry.known, point_calibration.PHANTOMS))]
+Phantom = Annotated[str, PlainValidator(partial(registry.known, PHANTOMS))]
 ORDINARY_C = 22.0  # of water, where no temperature is given
 SAME_WIDTH = 0.05  # relative difference of sx, which no sound changes, within which a B-scan is of the rig's scanner
 
@@ -42,8 +43,17 @@ class Settings(Part):
     face_row: Annotated[float, Field(ge=0, le=1e4)] | None = None
     """px, row of the images at which echoes have no delay, from which depths count: on an uncropped screen that of the
     B-scan's first row. Null is the clip's first row, 0 without a clip"""
-    phantom: Phantom = point_calibration.CROSSED_WIRES
-    """what the tank holds: a module of recon/probe_calibration/phantoms, which finds its one point in a B-scan"""
+    phantom: Phantom = CROSSED_WIRES
+    """what the tank holds: a module of recon/probe_calibration/phantoms, which finds it in a B-scan"""
+    wires: Path | None = None
+    """of n_wires: a PLUS configuration that defines them, .xml; null is PLUS's phantom fCal 2, of three N-wires"""
+    registration: Literal["known", "free"] | None = None
+    """of n_wires: known holds the phantom's pose in the reference frame as wires has it, PhantomToReference; free finds it by the
+    motion of the probe alone, which needs turns about two axes. Null is known for a sequence where there is one"""
+    registration_sigma_mm: Annotated[float, Field(gt=0, le=100)] = 0.5
+    """mm, standard deviation of a known registration along each axis; PLUS has its error as Error"""
+    wire_place_sigma_mm: Annotated[float, Field(gt=0, le=10)] = 0.1
+    """mm, standard deviation of the places of n_wires in their phantom; assumed, of holes that are printed or drilled"""
     wire_radius_mm: NotNegative = 0.1
     """mm; assumed, an ordinary fishing line. The echo comes from before the axis: 0.04 mm for nylon of this radius"""
     wire_radius_sigma_mm: NotNegative = 0.03
@@ -89,6 +99,15 @@ class Settings(Part):
             raise ValueError("medium_speed: expected temperature_c or tank_speed with it, found none")
         return self
 
+    @model_validator(mode="after")
+    def _of_wires(self) -> "Settings":
+        for name in ("wires", "registration"):
+            if getattr(self, name) is not None and self.phantom == CROSSED_WIRES:
+                raise ValueError(
+                    f"{name}: expected none with phantom={self.phantom}, found {getattr(self, name)}: phantom=n_wires?"
+                )
+        return self
+
     @property
     def wanted_speed(self) -> float:
         """Speed of sound, m/s, that the calibration is converted to where that of the tank is known."""
@@ -132,13 +151,13 @@ class Settings(Part):
 class Result:
     """A calibrated probe."""
 
-    adjustment: Adjustment  # in the tank's water
+    adjustment: Adjusted  # in the tank's water
     calibration: ProbeCalibration  # for the medium of later sweeps
     shown_sy: float  # mm/px by which the scanner draws depths; NaN if unknown
     implied_speed: tuple[float, float]  # of sound in the tank by both sy, m/s, and its standard deviation; NaN likewise
 
 
-def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner_sy: float | None = None) -> Result:
+def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_sy: float | None = None) -> Result:
     """Calibrate a probe; `design` holds the rig's.
 
     Without the tank's speed of sound the calibration holds for the one that sy implies.
@@ -152,23 +171,13 @@ def calibrate(frames: CrossingFrames, design: Probe, settings: Settings, scanner
     Raises
     ------
     InputError
-        As `recon.probe_calibration.point_calibration.calibrate`, or if sy implies an impossible speed of sound, or if neither the
+        As the phantom's `calibrate`, or if sy implies an impossible speed of sound, or if neither the
         tank's speed nor the scanner's scale is known.
     """
     expected = design.target_from_image.matrix()
     face_row = frames.first_row if settings.face_row is None else settings.face_row
     try:
-        found = point_calibration.calibrate(
-            frames.sightings,
-            frames.size,
-            settings.noise,
-            expected,
-            settings.seed,
-            settings.echo_ahead_mm,
-            settings.echo_ahead_sigma_mm,
-            settings.max_sigma_mm,
-            frames.numbers[frames.usable],
-        )
+        found = registry.kind(PHANTOMS, frames.phantom).calibrate(frames, settings, expected)
         found = replace(found, calibration=replace(found.calibration, face_row=float(face_row)))
         shown_sy = _design_sy(found.calibration, frames.size, design) if scanner_sy is None else scanner_sy
         implied = sound_in_water.implied_speed(found.calibration, shown_sy, settings.assumed_speed)

@@ -18,8 +18,8 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration, place_slopes
 from recon.model.rig import Probe
 from recon.probe_calibration import (
-    crossing_frames,
     movement,
+    phantom_frames,
     point_calibration,
     probe_checks,
     probe_figures,
@@ -27,6 +27,7 @@ from recon.probe_calibration import (
     sound_in_water,
     tank_calibration,
 )
+from recon.probe_calibration.point_calibration import Adjustment
 from recon.probe_calibration.repeatability import Mean
 from recon.session import probe_step
 from recon.session.probe_step import BY, FRAMES, PROBE, CalibratedProbe, Settings
@@ -52,6 +53,12 @@ class Run:
     calibration: ProbeCalibration  # for the medium of later sweeps
     found: CalibratedProbe | None = None  # None for a result of before, whose frames aren't read
 
+    @property
+    def adjustment(self) -> Adjustment | None:
+        """To the crossing in its frames; None for a result of before."""
+        adjusted = None if self.found is None else self.found.result.adjustment
+        return adjusted if isinstance(adjusted, Adjustment) else None
+
 
 @dataclass(frozen=True)
 class Repeated:
@@ -66,7 +73,7 @@ class Repeated:
     @property
     def noise_mm(self) -> Array:
         """As of `Adjustment.noise_mm` : (n,); NaN without frames."""
-        return np.array([np.nan if run.found is None else run.found.result.adjustment.noise_mm for run in self.runs])
+        return np.array([np.nan if run.adjustment is None else run.adjustment.noise_mm for run in self.runs])
 
 
 def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> None:
@@ -109,6 +116,11 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
         twice = next(sources[k] for k, place in enumerate(places) if place in places[:k])
         raise InputError(f"runs: expected each once, found {name_of(*twice)} twice: its repeatability would be 0")
     design = settings.rig.probe
+    if settings.phantom != phantom_frames.CROSSED_WIRES and (filmed := [one for one in sources if not _is_result(one[0])]):
+        expected = f"results of before, as {settings.phantom} shows no one point whose scatter is held out"
+        raise InputError(
+            f"runs: expected {expected}, found {name_of(*filmed[0])}: calibrate by each, and give the folders written"
+        )
     if any((path / MANIFEST).is_file() for path, _ in sources):
         probe_step.say_assumed(settings, watch)
     for path, sweep in sources:
@@ -118,7 +130,7 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
             lag = settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma
             frames = replace(probe_step.look(opened, settings, *lag), name=name)
         elif path.suffix.lower() == ".csv":
-            frames = crossing_frames.of_pairs(name, design.image_size, *sweep_tables.read_pairs(path))
+            frames = phantom_frames.of_pairs(name, design.image_size, *sweep_tables.read_pairs(path))
         else:
             yield Run(name, probe_files.read(path))
             continue
@@ -127,6 +139,10 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
             if line.startswith("warning"):
                 watch.say(f"{line} ({name})")
         yield Run(name, found.result.calibration, found)
+
+
+def _is_result(path: Path) -> bool:
+    return not (path / MANIFEST).is_file() and path.suffix.lower() != ".csv"
 
 
 def sources_of(path: Path) -> list[tuple[Path, str]]:
@@ -214,7 +230,7 @@ def shared_errors(runs: Sequence[Run], settings: Settings) -> Array:
         if settings.tank_known:
             faster = sound_in_water.in_medium(calibration, speed, speed + sigma)
             found[k, 1] = repeatability.step_between(calibration, faster)
-        adjusted = None if run.found is None else run.found.result.adjustment
+        adjusted = run.adjustment
         if adjusted is not None and adjusted.by_lag is not None:
             late = repeatability.after(adjusted.calibration, adjusted.by_lag)
             found[k, 2] = repeatability.step_between(*(in_medium_of(each, settings) for each in (adjusted.calibration, late)))
@@ -230,12 +246,13 @@ def in_medium_of(measured: ProbeCalibration, settings: Settings) -> ProbeCalibra
 
 def held_out_mm(run: Run, others: ProbeCalibration, settings: Settings) -> float:
     """Distance, mm, of a run's crossing from one place by the mean of the others; NaN of one without frames."""
-    if run.found is None:
+    if run.found is None or run.adjustment is None:
         return np.nan
     if settings.tank_known:
         others = sound_in_water.in_medium(others, settings.wanted_speed, settings.water_speed)
-    sightings, found = run.found.frames.sightings, run.found.result.adjustment
-    return point_calibration.held_out_mm(sightings, found, others, settings.noise, settings.echo_ahead_mm)
+    return point_calibration.held_out_mm(
+        run.found.frames.sightings, run.adjustment, others, settings.noise, settings.echo_ahead_mm
+    )
 
 
 def measure(repeated: Repeated) -> Metrics:

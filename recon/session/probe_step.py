@@ -1,4 +1,4 @@
-"""The ultrasound probe from B-scans of crossed wires: the settings of the step, the step, and the files of its result."""
+"""The ultrasound probe from B-scans of a phantom: the settings of the step, the step, and the files of its result."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -8,6 +8,7 @@ from typing import Annotated
 
 from pydantic import model_validator
 
+from recon import registry
 from recon.capture import probe_files, sweep_tables
 from recon.capture.sweep_part import SweepCapture
 from recon.files import atomic, metrics
@@ -15,12 +16,13 @@ from recon.files.metrics import Metrics
 from recon.freehand import sequence_sweep
 from recon.freehand.scans import ASSUMED
 from recon.freehand.sequence_sweep import SequenceFields, SequenceSweep
+from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model import tracks
 from recon.model.rig import NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
-from recon.probe_calibration import crossing_frames, probe_figures, sound_in_water, tank_calibration
-from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration import phantom_frames, probe_figures, sound_in_water, tank_calibration
+from recon.probe_calibration.phantom_frames import PHANTOMS, PhantomFrames
 from recon.probe_calibration.tank_calibration import Result
 from recon.registry import Choice
 from recon.session.settings import ScaleFields
@@ -38,7 +40,7 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
     """rig.probe is the design: where the bracket holds the probe to some 30 deg and 30 mm, the scanner's mm/px. Of another
     probe give temperature_c, and with pairs rig.probe.image_size; its bracket needs no design"""
     capture: Path | None = None
-    """a capture folder with a sweep over the crossing of two wires at rest. Or else:"""
+    """a capture folder with a sweep over a phantom at rest. Or else:"""
     sweep: str = ""
     """its name, of a capture that holds several; "" takes the only one for the probe"""
     pairs: Path | None = None
@@ -66,6 +68,8 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
         for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None), ("lag_sigma_s", self.lag_sigma_s or None)):
             if self.pairs is not None and value is not None:
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
+        if self.pairs is not None and self.phantom != phantom_frames.CROSSED_WIRES:
+            raise ValueError(f"phantom: expected none with pairs, which are of one point, found {self.phantom}")
         return self
 
     @property
@@ -79,13 +83,13 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
 class CalibratedProbe:
     """A probe with the covariance of its calibration, and the outcome of each frame."""
 
-    frames: CrossingFrames
+    frames: PhantomFrames
     result: Result
     figures: Metrics
 
 
 def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> None:
-    """Find the crossing in all frames, calibrate, judge and write.
+    """Find the phantom in all frames, calibrate, judge and write.
 
     Parameters
     ----------
@@ -96,18 +100,19 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     InputError
         If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
     """
-    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker)
+    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker, settings.wires)
     atomic.check_folder(out, BY, inputs=sources)
     earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
     if settings.temperature_c is not None:
         sound_in_water.speed_of_sound(settings.temperature_c)  # a mistake shows before the work
     design, start = settings.rig.probe, perf_counter()
     if settings.pairs is not None:
-        frames = crossing_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
+        frames = phantom_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
         sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "probe")
         say_assumed(settings, watch)
-        frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma)
+        reference = None if settings.sequence is None else settings.frame_names(FrameNames()).reference
+        frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma, reference)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
     for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
         watch.say(line)
@@ -134,18 +139,22 @@ def look(
     clip: Rectangle | None = None,
     watch: Watch = SILENT,
     lag_sigma_s: float = 0.0,
-) -> CrossingFrames:
-    """Find the crossing in the B-scans of a sweep, read one by one.
+    reference: str | None = None,
+) -> PhantomFrames:
+    """Find the phantom in the B-scans of a sweep, read one by one.
 
     Parameters
     ----------
     lag_s : s, of the B-scans behind the poses
     clip : part of each B-scan that is looked at; None for all of it
     lag_sigma_s : s, standard deviation of the lag
+    reference : frame of a sequence in which its poses are, None for a capture's world
     """
     chosen, part = settings or tank_calibration.Settings(), Clip(*clip) if clip else Clip(0, 0, *sweep.size)
-    images: Iterable = watch.follow(sweep.images(), len(sweep.frames), "looking for the crossing")
-    return crossing_frames.look(
+    kind = registry.kind(PHANTOMS, chosen.phantom)
+    known = kind.read(chosen, reference)
+    images: Iterable = watch.follow(sweep.images(), len(sweep.frames), f"looking for the {kind.SHOWS}")
+    return phantom_frames.look(
         sweep.name,
         (part.cut(image) for image in images),
         sweep.size,
@@ -155,18 +164,20 @@ def look(
         chosen.appearance,
         part.corner,
         chosen.phantom,
-        lag_sigma_s * tracks.rates_at(sweep.track, sweep.times, lag_s) if lag_sigma_s else None,
+        tracks.rates_at(sweep.track, sweep.times, lag_s) if lag_sigma_s or sweep.clocked else None,
+        lag_sigma_s,
+        known,
     )
 
 
 def calibrate(
-    frames: CrossingFrames,
+    frames: PhantomFrames,
     design: Probe,
     settings: tank_calibration.Settings,
     scanner_sy: float | None = None,
     watch: Watch = SILENT,
 ) -> CalibratedProbe:
-    """Calibrate the probe by the crossing in its frames.
+    """Calibrate the probe by the phantom in its frames.
 
     Parameters
     ----------
@@ -177,7 +188,7 @@ def calibrate(
     InputError
         If the frames are too few, or don't determine the calibration.
     """
-    crossing_frames.refuse_few(frames)
+    phantom_frames.refuse_few(frames)
     start = perf_counter()
     result = tank_calibration.calibrate(frames, design, settings, scanner_sy)
     seconds = {"seconds_calibrate": round(perf_counter() - start, 3)}

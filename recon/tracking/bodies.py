@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
 from recon.model.rig import parted_mm
 from recon.threads import mapped
-from recon.tracking import circle_detector, constellations
+from recon.tracking import circle_detector, constellations, covered_circle
 from recon.tracking.circle_detector import Detections
 from recon.tracking.constellations import Points
 from recon.tracking.pose import DISTINCT, GROSS_MM, distances
@@ -88,9 +89,11 @@ class BodyTracker:
         """Results of the bodies that aren't found yet, and those of the others with further bodies of their design."""
         for result in found.values():
             _take(detections, result)
-        claims = self._claims(detections.frames, *self._rings(detections))
-        settled = _settled([claim for claim in claims if claim.name not in found])
-        settled += _free([claim for claim in claims if claim.name in found], settled)
+        rings, points = self._rings(detections)
+        whole = self._claims(detections.frames, rings, points, POINTS)
+        settled = _settled([claim for claim in whole if claim.name not in found])
+        settled += _free([claim for claim in whole if claim.name in found], settled)
+        left = points.without(set().union(*(claim.rings for claim in settled)))
         results, others = dict(found), {name: list[Tracking]() for name in self.trackers}
         for name, result, _ in settled:
             if name in results:
@@ -98,8 +101,14 @@ class BodyTracker:
             else:
                 results[name] = result
                 _take(detections, result)
+        for name, result, _ in _free(self._claims(detections.frames, rings, left, POINTS - 1), ()):
+            if name in results:
+                others[name].append(result)
+            elif (told := self._told(name, result, results)).found:
+                results[name] = told
+                _take(detections, told)
         for name, further in others.items():
-            if any(one.found for one in further) or (name in results and results[name].found):
+            if name in results and results[name].found:
                 results[name] = self.trackers[name].nearest(results[name], [one for one in further if one.found])
         for name, tracker in self.trackers.items():
             if name not in results:
@@ -138,14 +147,20 @@ class BodyTracker:
         both = rings[0], rings[1]
         return both, constellations.points_of(both, first.cameras)
 
-    def _claims(self, frames: tuple[NDArray, NDArray], rings: tuple[Outlines, Outlines], points: Points) -> list[_Claim]:
-        """Each body at all rings that a pose of it fits."""
+    def _claims(
+        self, frames: tuple[NDArray, NDArray], rings: tuple[Outlines, Outlines], points: Points, least: int
+    ) -> list[_Claim]:
+        """Each body at all rings that a pose of it fits, of which both views show a number at least; others are sought again."""
         claims, first = [], next(iter(self.trackers.values())).target
         for name, tracker in self.trackers.items():
-            for choice in constellations.choices(points, tracker.target):
+            for choice in constellations.choices(points, tracker.target, least):
                 rims = constellations.chosen_rims(rings, points, choice)
                 if hole_of(tracker.target) != hole_of(first):
                     rims = [measure_again(frame, each, tracker.target) for frame, each in zip(frames, rims, strict=True)]
+                if (choice < 0).any():
+                    rims = [
+                        covered_circle.completed(frame, each, tracker.target) for frame, each in zip(frames, rims, strict=True)
+                    ]
                 result = tracker.posed((tracker.judged(0, rims[0]), tracker.judged(1, rims[1])), "detected")
                 if result.found:
                     taken = frozenset((k, ring) for k in (0, 1) for ring in points.rings[choice[choice >= 0], k].tolist())

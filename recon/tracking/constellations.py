@@ -4,7 +4,7 @@ Distances between points don't depend on where a body stands. So three points or
 circles are, whatever else is in view; names follow from the distances, without the detector's word.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,11 @@ class Points:
     rings: NDArray[np.int64]  # (m, 2) number of each view's ring
     places: Array  # (m, 3) mm
     radius_mm: Array  # (m,) of the ring, by its width in both views
+
+    def without(self, taken: Collection[tuple[int, int]]) -> "Points":
+        """The same without those of some rings, by view and number."""
+        free = np.array([(0, i) not in taken and (1, j) not in taken for i, j in self.rings.tolist()], bool)
+        return Points(self.rings[free], self.places[free], self.radius_mm[free])
 
 
 def rings_of(frame: NDArray, places: Array, networks: Networks, target: Target) -> Outlines:
@@ -84,10 +89,14 @@ def _radius(camera: Camera, ellipses: Ellipses, places: Array) -> Array:
     return np.linalg.eigvalsh(ellipses.shape)[:, 1] * depth / camera.matrix[0, 0]
 
 
-def choices(points: Points, target: Target) -> list[NDArray[np.int64]]:
+def choices(points: Points, target: Target, least: int = POINTS) -> list[NDArray[np.int64]]:
     """Ways to take points for a target's circles : (n,) numbers of points, -1 of a circle that isn't seen; the likeliest first.
 
     Those of more circles come first, then those of distances nearer to the target's.
+
+    Parameters
+    ----------
+    least : circles that are seen by both cameras; two leave the others to be sought in either
     """
     radius = target.outer_diameter_mm / 2
     fit = np.flatnonzero(np.abs(points.radius_mm - radius) < SIZES * radius)
@@ -106,7 +115,7 @@ def choices(points: Points, target: Target) -> list[NDArray[np.int64]]:
         for new in range(len(fit)):
             if all(not shared[new, one] and abs(far[new, one] - expected[k, number]) < GROSS_MM for number, one in seen):
                 yield from extended((*chosen, new))
-        if len(seen) + len(model) - k - 1 >= POINTS:
+        if len(seen) + len(model) - k - 1 >= least:
             yield from extended((*chosen, -1))
 
     def off(chosen: tuple[int, ...]) -> tuple[int, float]:

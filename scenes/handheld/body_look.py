@@ -4,6 +4,7 @@ Everything is in the target's frame, as in `handheld_assembly`: the board's fron
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ class Look(Kinds):
 
     PACKAGE = "scenes.handheld.looks"
     USUAL = "board"
+    IN_A_HAND: ClassVar[bool] = False
 
     def parts(self, rng: np.random.Generator, target: Target, stand: Stand) -> tuple[Part, ...]:
         """All that moves with the target, its print first; what the look leaves open is drawn."""
@@ -43,10 +45,14 @@ class Look(Kinds):
         """The tip : (3,) mm of a pointed body, None of others."""
         return None
 
+    def line_mm(self, target: Target) -> Array | None:
+        """The middle line : (n, 3) mm of a part that is thinner than a few pixels, None without one."""
+        return None
+
 
 def look_of(name: str) -> Look:
     """The look of a body that nothing is said of: that of its name, if there is one, or a board."""
-    return Look.named(name if name in registry.names(Look.PACKAGE) else Look.USUAL)()
+    return Look.model_validate({"kind": name if name in registry.names(Look.PACKAGE) else Look.USUAL})
 
 
 def any_stand(rng: np.random.Generator) -> Stand:

@@ -5,19 +5,21 @@ conf/dataset.yaml. The default path goes slowly, then fast, and partly out of ca
 Writes OUT/capture/, which `sonotwin track` reads like any hardware's, and OUT/truth/, which only evaluation opens: poses, motion,
 projected centres, blur and visibility. Takes about a second a frame on two cores (pixels=full: four), and a minute more when it
 first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused.
+With a rig that has further bodies, such as three_bodies, all of them are in view, each with its truth.
 
     sonotwin film out=outputs/film
     sonotwin film out=outputs/dark frames=120 seed=3 white_dn=20
+    sonotwin film out=outputs/bodies rig=three_bodies
 """
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import Field
+from pydantic import Field, model_validator
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SweepNameOrNone, sweep_part
@@ -44,6 +46,13 @@ class Config(film_session.Filming):
     quality: FilmQuality = FilmQuality()
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
+    @model_validator(mode="after")
+    def _of_the_rig(self) -> Self:
+        if unknown := [name for name in self.bodies if name not in self.rig.bodies]:
+            there = ", ".join(self.rig.bodies) or "none, such as rig=three_bodies has"
+            raise ValueError(f"bodies: expected names of the rig's further bodies ({there}), found {', '.join(unknown)}")
+        return self
+
 
 def run(config: Config) -> None:
     """Render the frames with their truth, and print the largest blur and the time.
@@ -59,9 +68,11 @@ def run(config: Config) -> None:
     )
     session.check()
     rig = drifted(config.rig, config.conditions.drift, config.seed)
-    rig = rig.model_copy(update={"target": printed(rig.target, config.conditions.target, config.seed)})
+    errors, bodies = config.conditions.target, enumerate(rig.bodies.items(), 1)
+    prints = {name: printed(target, errors, config.seed, number) for number, (name, target) in bodies}
+    rig = rig.model_copy(update={"target": printed(rig.target, errors, config.seed), "bodies": prints})
     with console.status("setting up the scene"):
-        bank = film_session.make_bank(rig, config.seed)
+        bank = film_session.make_bank(rig, ranges(), config, config.seed)
         made = film_session.takes(bank, rig, ranges(), config, config.seed, config.conditions.motion)
     start = perf_counter()
     blurs: list[float] = []

@@ -1,13 +1,18 @@
 """Read another group's folder into a capture, which all other verbs take.
 
-`layout=meza2021` is that of the rig's authors: SLdata/images, USdata/L, R and US, target_pose.npy, cross_point.npy, and the files
-of their calibrations, each as far as it is there. Images of any common kind become grey PNG. Their frames have no time stamps:
-frame k of all devices is taken at one moment, `camera_hz` a second. Rotations that are off by up to 2 % are taken as the nearest
-ones, and a negative scale as the same map, each with a warning. Writes the capture folder `out`; where poses and crossings of
-wires are there, pairs.csv in it, for `calibrate-probe`. A capture that is there already is replaced. Takes seconds.
+All layouts are of programs of the rig's authors, each read as far as it is there. `layout=meza2021` is that of their data sets:
+SLdata/images, USdata/L, R and US, target_pose.npy, cross_point.npy, and the files of their calibrations; `us_calibration`, of the
+probe's calibration: folders data1, data2, ... with L, R and UScrop, each a sweep, and cam1_cam2.npz; `stereo_basler`, of one
+recording of their acquisition: L, R and UScrop or US; `markerpose`, of their tracker's example: images/L, R and StereoParams.xml.
+Images of any common kind become grey PNG. Their frames have no time stamps: frame k of all devices is taken at one moment,
+`camera_hz` a second. Rotations that are off by up to 2 % are taken as the nearest ones, and a negative scale as the same map,
+each with a warning. Writes the capture folder `out`; where poses and crossings of wires are there, pairs.csv in it
+(pairs_data1.csv, ... of sets), for `calibrate-probe`. A capture that is there already is replaced. Takes seconds.
 
     sonotwin import folder=dataset out=session/capture
     sonotwin import folder=dataset speed_m_s=1488 purpose=probe out=wires/capture
+    sonotwin import layout=us_calibration folder=dataset out=wires/capture
+    sonotwin import layout=stereo_basler folder=acquisition out=stills/capture
 """
 
 from functools import partial
@@ -33,15 +38,18 @@ class Config(Part):
     """Fields of `sonotwin import`."""
 
     layout: Annotated[str, PlainValidator(partial(registry.known, LAYOUTS))] = "meza2021"
-    """meza2021: the rig authors' data sets"""
+    """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; stereo_basler: a recording
+    of their acquisition; markerpose: the example of their tracker"""
     folder: Path
-    """folder with SLdata/, USdata/ and files of calibrations, as far as they are there"""
+    """folder with SLdata/, USdata/ and files of calibrations; with data1/, data2/, ...; or with L/, R/ and UScrop/"""
     out: Path
     """the capture folder to write"""
-    camera_hz: Positive = 30.0
-    """frames/s; their frames have no time stamps, and all devices' count as taken at once"""
-    purpose: Purpose = "volume"
-    """of the sweep: probe, of crossed wires; latency, of a flat bottom; volume"""
+    camera_hz: Positive | None = None
+    """frames/s; their frames have no time stamps, and all devices' count as taken at once. null: 30, and 1 of stills, so of
+    the other layouts"""
+    purpose: Purpose | None = None
+    """of the sweep: probe, of crossed wires; latency, of a flat bottom; volume. null: volume of meza2021, probe of
+    us_calibration"""
     projector_size: tuple[Pixels, Pixels] = meza2021.PROJECTOR_SIZE
     """px; their files don't store it"""
     speed_m_s: Speed | None = None

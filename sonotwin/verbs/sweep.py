@@ -2,10 +2,10 @@
 
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
-path=wire alone, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times, and labels
-of what each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the default stroke,
-and a minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it they are refused. A
-capture holds several sweeps if each has a `name`.
+path=wire and path=rows, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times,
+and labels of what each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the
+default stroke, and a minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it
+they are refused. A capture holds several sweeps if each has a `name`.
 
 With `filmed=true` both cameras film the sweep, too: the rig's board, bracket and probe in a hand, over the very scene. The poses
 are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more.
@@ -15,6 +15,7 @@ are then in these frames, for `sonotwin track`, and nowhere else. Takes about a 
     sonotwin sweep filmed=true clocks.camera_hz=20 out=outputs/filmed
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
+    sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
 """
 
 from collections.abc import Iterable, Iterator
@@ -31,7 +32,7 @@ from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan
-from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath
+from twin.ultrasound.probe_path import Bob, RowPath, SurfacePath, WirePath
 
 if TYPE_CHECKING:
     from twin.tracking.rendered_views import Frames
@@ -64,7 +65,7 @@ def run(config: Config) -> None:
         film = filming(planned, console) if config.filmed else None
     count, moments = len(planned.plan.times), len(planned.plan.track.times)
     console.print(f"path        {led_along(config.path)}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
-    probe = None if isinstance(config.path, WirePath) else sweep_session.calibration_of(config.rig, config.ultrasound)
+    probe = None if isinstance(config.path, WirePath | RowPath) else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
     sweep_session.write_session(
         session, planned.scene, planned.scanned, config.ultrasound, planned.plan, shown(planned, console), probe, film
@@ -93,7 +94,7 @@ def shown(planned: PlannedSweep, console: Console) -> Iterator[Scan]:
         yield from progress.track(planned.scans(), total=len(planned.plan.times), description="rendering B-scans")
 
 
-def led_along(path: SurfacePath | Bob | WirePath) -> str:
+def led_along(path: SurfacePath | Bob | WirePath | RowPath) -> str:
     """How the probe is led, for the console; a raster is several strokes."""
     if isinstance(path, SurfacePath):
         return f"{path.strokes} strokes side by side" if path.strokes > 1 else "1 stroke"

@@ -30,7 +30,7 @@ class Config(poses_step.Settings):
     """Fields of `sonotwin track`."""
 
     out: Path
-    """folder: gets poses.csv, frames.csv, overlays/, metrics.json; bodies/ of further ones; manifest.json, if there are B-scans"""
+    """folder: gets poses.csv, frames.csv, overlays/, metrics.json; bodies/ of others; manifest.json, if there are B-scans"""
 
 
 def run(config: Config) -> int:

@@ -1,6 +1,7 @@
 """Train a network of the tracker: the detector, which finds circles in a view, or the segmenter, which outlines one in a patch.
 
-Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds. Their images are decoded into memory,
+Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds; and folders of MarkerPose's training
+data (data_centers.csv with images/, patch120/ with mask120/), which come after these. Their images are decoded into memory,
 150 kB a sample for a detector and 170 kB for a segmenter, or read from the shards as they are needed where that is more than
 `memory_gb`; the training is the same either way. Writes into the folder `out`: the network as ONNX for the tracker, its weights
 as .safetensors and .pt with the published names, metrics.json of the validation samples, the curves as log.jsonl and curves.png,
@@ -10,6 +11,7 @@ half an hour to some hours; the published ones take 6 to 20 times as long.
 
     sonotwin train network=detector data=outputs/dataset out=outputs/detector max_minutes=60
     sonotwin train network=published_segmenter data=outputs/dataset out=outputs/segmenter steps=20000 threads=1
+    sonotwin train network=segmenter data=outputs/dataset validation_data=theirs out=outputs/segmenter steps=5500
     sonotwin train network=detector data=[outputs/first,outputs/second] out=outputs/detector max_minutes=600 memory_gb=8
     sonotwin train network=detector data=outputs/more init=outputs/detector/detector.safetensors out=outputs/detector2 steps=5000
 """
@@ -20,7 +22,7 @@ from typing import Annotated
 
 import torch
 from matplotlib.figure import Figure
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
@@ -32,7 +34,8 @@ from recon.files.occupied import occupied
 from recon.model import circle_layout
 from recon.model.rig import Target
 from sonotwin.console_watch import LineConsole
-from trainers import export, fit, free_memory, shard_reader
+from sonotwin.folder_lists import Folders, listed
+from trainers import data_sets, export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.checkpoints import TRAIN
 from trainers.fit import Fitted, Plan, Precision
@@ -48,18 +51,7 @@ LONGEST_FIELD = 300  # letters, of a value that a message asks for, such as fold
 MEMORY_SHARE = 0.5  # of what is free, for images, if memory_gb isn't given
 
 
-def _listed(value: object) -> object:
-    return [value] if isinstance(value, str | Path) else value
-
-
-def _each_once(folders: list[Path]) -> list[Path]:
-    for place, folder in enumerate(folders):
-        if folder.resolve() in (other.resolve() for other in folders[:place]):
-            raise ValueError(f"expected each folder once, found {folder} twice")
-    return folders
-
-
-Folders = Annotated[list[Path], BeforeValidator(_listed), AfterValidator(_each_once), Field(min_length=1)]
+SomeFolders = Annotated[Folders, Field(min_length=1)]
 
 
 class Config(BaseModel):
@@ -68,14 +60,14 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
     network: Name
-    data: Folders
+    data: SomeFolders
     out: Path
     steps: Annotated[int, Field(ge=1)] | None = None
     max_minutes: Annotated[float, Field(gt=0, le=100_000)] | None = None
     init: Path | None = None
     resume: bool = True
     partial: bool = False
-    validation_data: Folders | None = None
+    validation_data: SomeFolders | None = None
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.05
     batch: Annotated[int, Field(ge=2, le=4096)] | None = None
     crop_px: Annotated[int, Field(ge=64, le=240, multiple_of=8)] = 160
@@ -167,7 +159,7 @@ def check_resumed(config: Config) -> bool:
         return False
     try:
         before = json_text.read(marker)
-        before |= {name: _listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
+        before |= {name: listed(before[name]) for name in LISTS}  # runs of earlier versions had one folder
         differing = [name for name, value in settings(config).items() if name not in MAY_CHANGE and before[name] != value]
         expected = [f"{name}={given(before[name])}" for name in differing]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -206,7 +198,7 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
     """Training and validation samples, in memory as far as they may be."""
-    reader = shard_reader.read_views if is_detector(config.network) else shard_reader.read_patches
+    reader = data_sets.read_views if is_detector(config.network) else data_sets.read_patches
     with console.status("reading") as status:
         data = reader(config.data, lambda count: status.update(f"reading, {count} samples"), config.partial)
         if config.validation_data is not None:

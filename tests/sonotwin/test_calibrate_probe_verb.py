@@ -14,7 +14,7 @@ import pytest
 
 from recon.capture import probe_files, sweep_tables
 from recon.geometry import rigid
-from recon.probe_calibration import point_calibration, probe_checks, repeatability, sound_in_water
+from recon.probe_calibration import phantom_frames, point_calibration, probe_checks, repeatability, sound_in_water
 from sonotwin import config
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
@@ -334,11 +334,12 @@ BEAD = '''
 import numpy as np
 
 from recon.probe_calibration.cross_wire import Appearance, Crossing
+from recon.probe_calibration.point_phantom import MIN_FRAMES, SHOWS, WAYS, calibrate, describe, figures, read, sight
 
 NOTHING = np.full(2, np.nan)
 
 
-def find(image, appearance):
+def find(image, appearance, known):
     """The bead, below the face's ringing."""
     look = appearance or Appearance()
     level = np.asarray(image, float)[look.top_px :]
@@ -354,8 +355,8 @@ def test_another_phantom_is_one_module(capture, rig, tmp_path, monkeypatch, caps
     """Its finder is found by the name in `phantom`, and its point calibrates the probe."""
     fields = [f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", "phantom=bead"]
     assert main(["calibrate-probe", *fields]) == 2
-    assert "phantom: expected 'crossed_wires', found 'bead'" in capsys.readouterr().err
-    added.add(monkeypatch, tmp_path / "ours", point_calibration.PHANTOMS, "bead", BEAD)
+    assert "phantom: expected 'crossed_wires' or 'n_wires', found 'bead'" in capsys.readouterr().err
+    added.add(monkeypatch, tmp_path / "ours", phantom_frames.PHANTOMS, "bead", BEAD)
     calibrate(*fields)
     found, true = probe_files.read(tmp_path / "out" / "probe.yaml"), sweep_sets.probe_in_water(rig)
     pixels = repeatability.five_points(bscans.SIZE)

@@ -98,6 +98,19 @@ def test_the_speed_of_sound_comes_back(capture, tmp_path, capsys):
     assert "sonotwin-export.json: speed_m_s: expected" in capsys.readouterr().err
 
 
+def test_poses_are_those_of_the_frames_beside_them(capture, tmp_path, capsys):
+    """By a lag of 0.4 periods B-scans lie between frames; without frames each has its own pose."""
+    fields = [f"capture={capture}", f"lag_s={0.6 * LAG_S}", f"out={tmp_path / 'theirs'}"]
+    assert main(["export", *fields]) == 0
+    assert "10 ms from their B-scans (median; 10 at most), in which the target moved by 2 mm" in capsys.readouterr().out
+    assert np.load(tmp_path / "theirs/USdata/target_pose.npy") == pytest.approx(poses()[:-1])
+    assert main(["export", *fields, "frames=false"]) == 0
+    own = np.load(tmp_path / "theirs/USdata/target_pose.npy")
+    assert own[:, 0, 3] == pytest.approx(poses()[:-1, 0, 3] + 2) and not (tmp_path / "theirs/USdata/L").exists()
+    assert main(["export", *fields, "apart_s=0.005"]) == 2
+    assert "expected frames within 5 ms of a B-scan, found the nearest 10 ms away" in capsys.readouterr().err
+
+
 def test_their_program_finds_its_files(capture, tmp_path):
     """Names, shapes and numbering are those that their scripts read."""
     ball = trimesh.creation.icosphere(radius=1.0)

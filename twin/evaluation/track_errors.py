@@ -13,9 +13,10 @@ from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.geometry import rigid
+from recon.model.rig import PROBE
 from recon.model.tracks import Track
 from twin.session import TruthFolder
-from twin.tracking.film_session import TRUTH
+from twin.tracking.film_session import truth_name
 
 Array = NDArray[np.float64]
 
@@ -50,12 +51,13 @@ class Errors:
         return np.isfinite(self.shift_mm)
 
 
-def read_truth(folder: Path, name: str = "") -> FilmTruth:
+def read_truth(folder: Path, name: str = "", body: str = PROBE) -> FilmTruth:
     """Read a film's truth folder.
 
     Parameters
     ----------
     name : of one of several sweeps.
+    body : whose truth is read, one of the rig's.
 
     Raises
     ------
@@ -70,7 +72,7 @@ def read_truth(folder: Path, name: str = "") -> FilmTruth:
         "inside": Form("b", (None, 2, 3)),
     }
     part = sweep_part(name)
-    content = TruthFolder(folder, part).arrays(f"{part}/{TRUTH}", forms)
+    content = TruthFolder(folder, part).arrays(f"{part}/{truth_name(body)}", forms)
     return FilmTruth(*(content[name] for name in forms))
 
 

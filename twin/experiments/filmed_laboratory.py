@@ -15,7 +15,7 @@ import trimesh
 
 from recon.model.calibration import Calibration
 from recon.model.rig import Rig
-from recon.probe_calibration.crossing_frames import CrossingFrames
+from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.tank_calibration import Result
 from recon.probe_calibration.tank_calibration import Settings as Tank
 from recon.session import probe_step, skin_step
@@ -98,21 +98,21 @@ def wires(lab: FilmedLaboratory, number: int) -> TrackedSweep:
     return swept(lab, f"wires{number}", {"kind": "crosswire"}, path, Clocks(camera_hz=AT_REST_HZ), WATER)
 
 
-def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> CrossingFrames:
+def crossings(lab: FilmedLaboratory, sweep: TrackedSweep) -> PhantomFrames:
     """The first 30 B-scans in which the crossing is seen while both methods have a pose."""
     own, seen = sweep.ours, np.isfinite(sweep.published_at(lab.latency_s)).all(axis=(1, 2))
     found = probe_step.look(own, lag_s=lab.latency_s)
     kept = found.usable[seen[found.usable]][: probe_accuracy.IMAGES]
-    some = tuple(replace(one, reason=one.reason or (None if k in kept else NOT_KEPT)) for k, one in enumerate(found.crossings))
-    return replace(found, sightings=found.sightings.of(np.isin(found.usable, kept)), crossings=some)
+    some = tuple(replace(one, reason=one.reason or (None if k in kept else NOT_KEPT)) for k, one in enumerate(found.seen))
+    return replace(found, sightings=found.sightings.of(np.isin(found.usable, kept)), seen=some)
 
 
-def calibrated(lab: FilmedLaboratory, found: CrossingFrames) -> Result:
+def calibrated(lab: FilmedLaboratory, found: PhantomFrames) -> Result:
     """Our calibration."""
     return probe_step.calibrate(found, lab.rig.probe, Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0)).result
 
 
-def published(lab: FilmedLaboratory, found: CrossingFrames, sweep: TrackedSweep, rng: np.random.Generator) -> Solved:
+def published(lab: FilmedLaboratory, found: PhantomFrames, sweep: TrackedSweep, rng: np.random.Generator) -> Solved:
     """The published calibration, of the same crossings, clicked by hand."""
     clicks = published_probe.clicked(found.sightings.pixels, lab.settings.noise.click_px, rng)
     return published_probe.calibrate(sweep.published_at(lab.latency_s)[found.usable], clicks)

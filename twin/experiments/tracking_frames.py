@@ -16,7 +16,7 @@ from twin.tracking.surface_prints import BitGrid
 BATCH = 4  # takes in one launch
 STUDY_VARIANTS = 12  # of bodies and surroundings
 MOST_TRIES = 50  # poses for each that shows the target whole
-FINE = FilmQuality(rim=16)  # of several bodies
+FINE = FilmQuality(view=4, rim=64)  # of several bodies: fewer rays of cells leave more noise in shadows than sensors do
 WHOLLY = 0.999  # of each disc: what a study asks to be seen of them
 
 

@@ -96,7 +96,7 @@ def raster(card: Card) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     with TemporaryDirectory() as name:
         path, sheet = Path(name, "sheet.pdf"), paper_sheet.lay_out(card.size, paper_sheet.PAPERS["a4"], MARGIN_MM)
         assert sheet is not None
-        paper_sheet.write(path, card, sheet, MARGIN_MM, "sheet", ["sonotwin"])
+        paper_sheet.write(path, [paper_sheet.Page(card, sheet, ["sonotwin"])], MARGIN_MM, "sheet")
         page = pypdfium2.PdfDocument(path)[0]
         image = page.render(scale=DPI / 72, grayscale=True).to_numpy()
         size = np.array(page.get_size())

@@ -4,7 +4,7 @@ A kind of path is a module of `twin.tracking.film_paths`, found by its name, wit
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,10 +61,11 @@ class FilmPath(Kinds):
     USUAL = "hand"
 
     @abstractmethod
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL) -> Way:
+    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
         """Lead the target along the path, its face to the point between the cameras : (3,) mm.
 
         errors : of which the tremor is added.
+        body : its number, of one besides the probe
         """
 
     @property

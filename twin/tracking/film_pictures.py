@@ -31,6 +31,7 @@ CELL_PX, NEAR_CELL_PX = 4, 2
 AROUND_PX = 24  # beyond the target's board
 BEYOND = 0.42  # radii beyond a circle's rim: a fit of the rim reaches to 0.37
 RIM_PX = 4.0  # on either side of a rim, and half of the motion's blur
+LINE_PX = 16.0  # about a thin part
 TILE = 4  # cells along each axis, among which the points of one set are dealt out: alike in all tiles, which leaves no noise
 
 
@@ -125,7 +126,10 @@ def film_picture(
         near = about_target(held, device, late, target) if held.present else None
         if near is not None:
             about.append(Cells(*near, NEAR_CELL_PX, quality.view))
-            corners = camera.project(rigid.apply(held.motion.later(late).world_from_target, board_corners(target)))
+            pose = held.motion.later(late).world_from_target
+            if held.line is not None:
+                sharp.append(line_pixels(camera.project(rigid.apply(pose, held.line)), truth[name], size, quality))
+            corners = camera.project(rigid.apply(pose, board_corners(target)))
             sharp.append(sharp_pixels(truth[name], corners, size, target, quality, number))
     return FilmPicture(size, [Cells((0, 0), size, CELL_PX, quality.view), *about, *sharp])
 
@@ -139,6 +143,15 @@ def about_target(held: Held, device: CameraDevice, late: float, target: Target) 
     low = np.clip(np.floor(places.min(axis=0)) - AROUND_PX, 0, size)
     extent = np.clip(np.ceil(places.max(axis=0)) + AROUND_PX + 1, 0, size) - low
     return (tuple(low.astype(int).tolist()), tuple(extent.astype(int).tolist())) if extent.min() >= 2 else None
+
+
+def line_pixels(places: Array, truth: ViewTruth, size: tuple[int, int], quality: FilmQuality) -> Pixels:
+    """Pixels beside a line through places : (n, 2) px."""
+    mask = np.zeros(size[::-1], np.uint8)
+    width = round(LINE_PX + float(truth.blur_px.max()))
+    cv2.polylines(mask, [np.rint(places).astype(np.int32)], isClosed=False, color=1, thickness=width)
+    v, u = mask.nonzero()
+    return Pixels(u, v, np.full(u.size, quality.disc), np.full(u.size, NO_CIRCLE))
 
 
 def sharp_pixels(

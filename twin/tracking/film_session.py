@@ -1,11 +1,11 @@
 """Films: a hand leads the target along a smooth path before both cameras, frame by frame, with the truth of each.
 
-One body, one surroundings, one light and one exposure for all frames, all from a seed. Over an exposure the target moves evenly,
-by the path's own derivative in the middle of it.
+One probe, one surroundings, one light and one exposure for all frames, all from a seed. Over an exposure the target moves evenly,
+by the path's own derivative in the middle of it. Further bodies of the rig follow paths of their own beside the probe's.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,27 +17,46 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import Positive, Rig
+from recon.model.rig import PROBE, BodyName, Part, Positive, Rig, Target
+from scenes.handheld.body_look import Look, Stand, look_of
+from scenes.handheld.handheld_assembly import held
+from scenes.handheld.surroundings import surroundings
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, describe
 from twin.shooting import FilmQuality, Quality, Shooting
-from twin.tracking.film_path import STILL, FilmPath
-from twin.tracking.mesh_bank import Bank, build_bank, uncovered
-from twin.tracking.rendered_views import Frames, render_film, render_full, white_radiance
-from twin.tracking.samples import Motion, Take, draw
+from twin.tracking.film_path import STILL, FilmPath, Way
+from twin.tracking.film_paths import hand
+from twin.tracking.mesh_bank import Bank, bank_of, build_bank, uncovered, uncovered_share
+from twin.tracking.rendered_views import Frames, Views, render_film, render_full, white_radiance
+from twin.tracking.samples import Held, Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
-from twin.tracking.target_truth import ViewTruth
+from twin.tracking.study_samples import CLEAN
 
 Array = NDArray[np.float64]
 
-TRUTH = "film.npz"  # in the sweep's own folder of truth
+TRUTH = "film.npz"  # of the probe, in the sweep's own folder of truth; see `truth_name`
 BODIES = 4  # of which the one is taken whose fingers and cable cover least of the circles
 LOOKS = 8  # frames in which that is looked at
 NEAREST_MM = 100.0  # of a circle before a camera, along its axis
 BATCH = 6  # frames traced in one launch; doesn't change them
+FAR_LAMPS_MM = (1000.0, 2500.0)  # that all bodies are about as bright
+TABLE_MM = 40.0  # a needle's tip may reach past the probe's path: what surrounds begins 60 mm behind that
 
-Views = tuple[ViewTruth, ViewTruth]
+Seen = Mapping[str, Views]  # truth of a pair by bodies' names
+
+
+# of bodies that no path is given for, beside the probe's usual one: the first above, the second below, facing the cameras
+PLACES_MM = ((70.0, -46.0, 660.0), (76.0, 46.0, 668.0))
+ROLLS_DEG = (75.0, 20.0)
+BREATH_MM, BREATH_S, SWAY_MM = 1.5, 4.0, 12.0  # by which a body on a post moves, in what time, and by which a hand does
+
+
+class FilmedBody(Part):
+    """Look and path of a body besides the probe."""
+
+    look: Look | None = None  # that of its name if there is one, or a board on a post
+    path: FilmPath | None = None  # beside the probe's usual one
 
 
 class Filming(Shooting):
@@ -46,6 +65,7 @@ class Filming(Shooting):
     frames: Annotated[int, Field(ge=1, le=100_000)] = 30
     camera_hz: Positive = 30.0
     path: FilmPath
+    bodies: dict[BodyName, FilmedBody] = Field(default_factory=dict)  # besides the probe, of those that the rig has
 
     @model_validator(mode="after")
     def _one_after_the_other(self) -> "Filming":
@@ -53,42 +73,132 @@ class Filming(Shooting):
             raise ValueError(f"exposure_s: expected at most 1 / camera_hz = {1 / self.camera_hz:.4g}, found {self.exposure_s:g}")
         return self
 
+    def look(self, name: str) -> Look:
+        """Look of a body besides the probe."""
+        given = self.bodies.get(name)
+        return look_of(name) if given is None or given.look is None else given.look
+
     @property
     def times(self) -> NDArray[np.int64]:
         """Middles of the exposures : (n,) ns."""
         return np.rint(np.arange(self.frames) * 1e9 / self.camera_hz).astype(np.int64)
 
 
-def make_bank(rig: Rig, seed: int) -> Bank:
-    """The bodies and surroundings that a film is chosen from."""
-    return build_bank(rig.target, BODIES, seed)
+@dataclass(frozen=True)
+class Stage:
+    """A film before its bodies are built: what is drawn once, set up about the paths, and the ways of all bodies by name."""
+
+    drawn: Take
+    ways: Mapping[str, Way]
+
+    def motions(self, filming: Filming) -> dict[str, list[Motion]]:
+        """Of each body over all exposures."""
+        times = (filming.times * 1e-9).tolist()
+        return {name: [way.motion(time, filming.exposure_s) for time in times] for name, way in self.ways.items()}
+
+    def stand(self, name: str) -> Stand:
+        """Where a body stands when the film begins, from its target; an arm leads away from the middle of all."""
+        way, into_scene = self.ways[name], self.drawn.scene_from_world
+        pose = way.pose(0.0)
+        into = rigid.invert(pose)
+        eyes = np.array([device.optics.camera().centre for device in self.drawn.cameras])
+        height = float(rigid.apply(into_scene, way.middle(0.0))[2])
+        outwards = way.middle(0.0) - np.mean([other.middle(0.0) for other in self.ways.values()], axis=0)
+        away = rigid.rotate(into, outwards - [0, 0, outwards[2]])
+        return Stand(rigid.apply(into, eyes), rigid.rotate(into, into_scene[2, :3]), height, away / np.linalg.norm(away))
+
+
+def set_stage(rig: Rig, ranges: DataRanges, filming: Filming, seed: int, errors: conditions.Motion = STILL) -> Stage:
+    """Draw what a film has once, as for a data set's sample, and lead all bodies.
+
+    Raises
+    ------
+    InputError
+        If a body has no path, or a path leads too near to a camera.
+    """
+    light = ranges.light.model_copy(update={"projector_share": 0.0} | ({"lamp_mm": FAR_LAMPS_MM} if rig.bodies else {}))
+    drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
+    cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    eyes = (cameras[0].centre + cameras[1].centre) / 2
+    ways, farthest = {PROBE: filming.path.lead(rig.target, eyes, seed, errors)}, filming.path.room_mm
+    for number, (name, target) in enumerate(rig.bodies.items(), 1):
+        look, given = filming.look(name), filming.bodies.get(name, FilmedBody())
+        path = given.path or _beside(name, number - 1, look)
+        ways[name] = path.lead(target, eyes, seed, errors if look.IN_A_HAND else STILL, [number])
+        tip = look.tip_mm(target)
+        reach = 0.0 if tip is None else rigid.apply(ways[name].pose(0.0), tip)[2] - TABLE_MM
+        farthest[2] = max(farthest[2], path.room_mm[2], reach)
+    moved = farthest - drawn.motion.world_from_target[:3, 3]
+    lamps = drawn.lighting.lamps.copy()
+    lamps[:, :3] += moved
+    scene = drawn.scene_from_world @ rigid.transform(np.eye(3), -moved)
+    lighting = replace(drawn.lighting, lamps=lamps)
+    same = replace(drawn, cameras=(rig.cam1, rig.cam2), present=True, lighting=lighting, scene_from_world=scene)
+    return Stage(same, ways)
+
+
+def _beside(name: str, number: int, look: Look) -> FilmPath:
+    """The path of a body that none is given for."""
+    if number >= len(PLACES_MM):
+        raise InputError(
+            f"bodies.{name}.path: needs a value: {len(PLACES_MM)} bodies have one beside the probe's, this is another"
+        )
+    place, roll = np.array(PLACES_MM[number]), ROLLS_DEG[number]
+    if not look.IN_A_HAND:
+        breath = tuple(
+            (*place[:2].tolist(), float(place[2]) + depth) for depth in (0.0, 0.5 * BREATH_MM, BREATH_MM, 0.5 * BREATH_MM)
+        )
+        return hand.Kind(seconds=BREATH_S, places_mm=breath, roll_deg=roll, turn_deg=0.0, unsteady_mm=0.0)
+    swayed = tuple(
+        tuple((place + SWAY_MM * np.array(way)).tolist()) for way in ((0, 0, 0), (0.6, -0.3, 1), (1, 0.4, 0), (0.2, 0.6, -1))
+    )
+    return hand.Kind(places_mm=swayed, roll_deg=roll)
+
+
+def make_bank(rig: Rig, ranges: DataRanges, filming: Filming, seed: int) -> Bank:
+    """The bodies and surroundings that a film is chosen from: variants of the probe, then each further body as it looks."""
+    if not rig.bodies:
+        return build_bank(rig.target, BODIES, seed)
+    stage = set_stage(rig, ranges, filming, seed)
+    streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in range(2 + len(rig.bodies))]
+    bodies = [held(streams[0], rig.target) for _ in range(BODIES)]
+    bodies += [
+        filming.look(name).parts(stream, target, stage.stand(name))
+        for stream, (name, target) in zip(streams[2:], rig.bodies.items(), strict=True)
+    ]
+    return bank_of(bodies, [surroundings(streams[1]) for _ in range(BODIES)])
 
 
 def takes(bank: Bank, rig: Rig, ranges: DataRanges, filming: Filming, seed: int, errors: conditions.Motion = STILL) -> list[Take]:
-    """Parameters of each frame: all is drawn once, as for a data set's sample, but the pose, the motion and the noise."""
-    light = ranges.light.model_copy(update={"projector_share": 0.0})
-    drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
+    """Parameters of each frame: all is drawn once, as for a data set's sample, but the poses, the motions and the noise."""
+    stage = set_stage(rig, ranges, filming, seed, errors)
+    motions = stage.motions(filming)
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
-    way = filming.path.lead(rig.target, (cameras[0].centre + cameras[1].centre) / 2, seed, errors)
-    motions = [way.motion(time * 1e-9, filming.exposure_s) for time in filming.times.tolist()]
-    for motion in motions:
-        places = rigid.apply(motion.world_from_target, circle_centres(rig.target))
-        if min(rigid.apply(camera.camera_from_world, places)[:, 2].min() for camera in cameras) < NEAREST_MM:
-            raise InputError(f"path: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
-    some = [motions[k].world_from_target for k in np.linspace(0, len(motions) - 1, min(LOOKS, len(motions))).astype(int)]
-    eyes = np.array([rigid.apply(rigid.invert(pose), camera.centre) for pose in some for camera in cameras])
-    moved = filming.path.room_mm - drawn.motion.world_from_target[:3, 3]
-    lamps = drawn.lighting.lamps.copy()
-    lamps[:, :3] += moved
-    same = replace(
-        drawn,
-        cameras=(rig.cam1, rig.cam2),
-        present=True,
-        body=int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(BODIES)])),
-        lighting=replace(drawn.lighting, lamps=lamps),
-        scene_from_world=drawn.scene_from_world @ rigid.transform(np.eye(3), -moved),
-    )
-    return in_a_row(same, motions, rig, filming, seed, errors)
+    for name, own in motions.items():
+        places = np.array([rigid.apply(motion.world_from_target, circle_centres(rig.targets[name])) for motion in own])
+        if min(rigid.apply(camera.camera_from_world, places)[..., 2].min() for camera in cameras) < NEAREST_MM:
+            field = "path" if name == PROBE else f"bodies.{name}.path"
+            raise InputError(f"{field}: expected places at least {NEAREST_MM:g} mm before both cameras, found nearer ones")
+    led = motions.pop(PROBE)
+    face = replace(CLEAN, ink=stage.drawn.face.ink, paper=stage.drawn.face.paper)  # of the same printer as the probe's
+    lines = {name: filming.look(name).line_mm(rig.targets[name]) for name in motions}
+    others = [
+        {name: Held(own[k], BODIES + number, face, line=lines[name]) for number, (name, own) in enumerate(motions.items())}
+        for k in range(len(led))
+    ]
+    centres = np.array([camera.centre for camera in cameras])
+    looked = np.linspace(0, len(led) - 1, min(LOOKS, len(led))).astype(int)
+    if others[0]:
+        some = [replace(stage.drawn, motion=led[k], others=others[k]) for k in looked]
+        shares = [
+            np.mean([uncovered_share(bank, replace(take, body=body), rig.targets, centres) for take in some])
+            for body in range(BODIES)
+        ]
+    else:
+        eyes = np.array([rigid.apply(rigid.invert(led[k].world_from_target), centre) for k in looked for centre in centres])
+        shares = [uncovered(bank, body, rig.target, eyes) for body in range(BODIES)]
+    made = in_a_row(replace(stage.drawn, body=int(np.argmax(shares))), led, rig, filming, seed, errors)
+    return [replace(take, others=its) for take, its in zip(made, others, strict=True)]
 
 
 def in_a_row(
@@ -132,7 +242,7 @@ def write_session(
     """
     with session.write(describe(Scene("film", ()), labels=[])) as (capture, truth):
         truth.write_optics(cameras_of(rig))
-        seen: list[Views] = []
+        seen: list[Seen] = []
         capture.complete_calibration(cameras_of(calibrated))
         capture.add_sweep(
             dict.fromkeys(CAMERAS, filming.times),
@@ -140,9 +250,17 @@ def write_session(
             devices(rig, filming),
             name=session.part.partition("/")[2],
         )
-        truth.write_arrays(
-            f"{session.part}/{TRUTH}", {**truth_arrays(filming.times, made, seen), **filming.path.truth(rig.target)}
-        )
+        for name in made[0].held:
+            arrays = truth_arrays(filming.times, made, seen, name)
+            truth.write_arrays(f"{session.part}/{truth_name(name)}", {**arrays, **_tip(filming, name, rig.targets[name])})
+
+
+def _tip(filming: Filming, body: str, target: Target) -> Mapping[str, Array]:
+    """The tip of a body, by its path or its look, in the target's frame; nothing where it has none."""
+    if body == PROBE:
+        return filming.path.truth(target)
+    tip = filming.look(body).tip_mm(target)
+    return {} if tip is None else {"tip_mm": tip}
 
 
 def devices(rig: Rig, shooting: Shooting) -> dict[str, Device]:
@@ -151,10 +269,10 @@ def devices(rig: Rig, shooting: Shooting) -> dict[str, Device]:
     return {name: Device(size=size, exposure_s=shooting.exposure_s, gain=shooting.gain) for name, size in sizes.items()}
 
 
-def images(frames: Iterable[Frames], seen: list[Views]) -> Iterator[tuple[str, NDArray]]:
+def images(frames: Iterable[Frames], seen: list[Seen]) -> Iterator[tuple[str, NDArray]]:
     """Images of both cameras, pair by pair, each with its camera's name; the truth of the views is noted."""
     for one in frames:
-        seen.append(one.truth)
+        seen.append(one.bodies)
         yield from zip(CAMERAS, one.views, strict=True)
 
 
@@ -163,16 +281,22 @@ def cameras_of(rig: Rig) -> Calibration:
     return Calibration({name: getattr(rig, name).optics.camera() for name in CAMERAS})
 
 
-def truth_arrays(times: NDArray[np.int64], made: Sequence[Take], seen: Sequence[Views]) -> dict[str, NDArray]:
-    """By name: (n, ...) of each frame, (n, 2, ...) of each view; lengths in mm and px."""
+def truth_name(body: str) -> str:
+    """File of a body's truth, in the sweep's own folder of truth."""
+    return TRUTH if body == PROBE else f"bodies/{body}.npz"
+
+
+def truth_arrays(times: NDArray[np.int64], made: Sequence[Take], seen: Sequence[Seen], body: str = PROBE) -> dict[str, NDArray]:
+    """Truth of a body by name: (n, ...) of each frame, (n, 2, ...) of each view; lengths in mm and px."""
     views = {
-        name: np.array([[getattr(view, name) for view in both] for both in seen])
+        name: np.array([[getattr(view, name) for view in bodies[body]] for bodies in seen])
         for name in ("centres", "ellipses", "inside", "blur_px", "visible", "white_dn")
     }
+    motions = [take.held[body].motion for take in made]
     return {
         "times_ns": times,
-        "world_from_target": np.array([take.motion.world_from_target for take in made]),
-        "shift_mm": np.array([take.motion.shift_mm for take in made]),
-        "turn_rad": np.array([take.motion.turn_rad for take in made]),
+        "world_from_target": np.array([motion.world_from_target for motion in motions]),
+        "shift_mm": np.array([motion.shift_mm for motion in motions]),
+        "turn_rad": np.array([motion.turn_rad for motion in motions]),
         **views,
     }

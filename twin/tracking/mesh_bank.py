@@ -88,8 +88,8 @@ def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
     return 1 - float(np.mean(np.array(bank.bodies.ray_test(ray, dr.full(mi.Bool, True, len(start))))))
 
 
-def all_uncovered(bank: Bank, take: Take, targets: Mapping[str, Target], eyes: Array) -> bool:
-    """Whether eyes : (n, 3) mm in the world see all circles' rims past all bodies and surroundings, in mid-exposure."""
+def uncovered_share(bank: Bank, take: Take, targets: Mapping[str, Target], eyes: Array) -> float:
+    """Share of all circles' rims that eyes : (n, 3) mm in the world see past all bodies and surroundings, in mid-exposure."""
     poses = {name: held.motion.world_from_target for name, held in take.held.items()}
     rims = []
     for name, pose in poses.items():
@@ -100,13 +100,13 @@ def all_uncovered(bank: Bank, take: Take, targets: Mapping[str, Target], eyes: A
     ways = np.repeat(eyes, len(rim), axis=0) - start
     distance = np.linalg.norm(ways, axis=1, keepdims=True)
     worlds = [(bank.bodies, rigid.invert(poses[name]), bank.body_at[held.body]) for name, held in take.held.items()]
+    covered = np.zeros(len(start), bool)
     for world, into, at in (*worlds, (bank.scenes, take.scene_from_world, bank.scene_at[take.surroundings])):
         place, way = rigid.apply(into, start) + at, rigid.rotate(into, ways / distance)
         ray = mi.Ray3f(mi.Point3f(*np.float32(place).T), mi.Vector3f(*np.float32(way).T))
         ray.maxt = mi.Float(np.float32(distance.ravel()))
-        if np.array(world.ray_test(ray, dr.full(mi.Bool, True, len(start)))).any():
-            return False
-    return True
+        covered |= np.array(world.ray_test(ray, dr.full(mi.Bool, True, len(start))))
+    return 1 - float(covered.mean())
 
 
 def _places(count: int, pitch: float) -> Array:

@@ -308,8 +308,8 @@ class _Path:
 
         turned, crossed : the ray in each target's frame, and where it crosses the face's plane.
         """
-        met = None
-        for body, its in zip(self.bodies, turned, strict=True):
+        met = self.bodies[0].meet(self.bank, turned[0], time, None)
+        for body, its in zip(self.bodies[1:], turned[1:], strict=True):
             met = body.meet(self.bank, its, time, met)
         in_scene = self._scene_ray(ray)
         in_scene.maxt = mi.Float(met.distance)  # infinite where all bodies are missed

@@ -91,6 +91,7 @@ class Held:
     body: int  # number of the variant in the bank
     face: Print
     present: bool = True
+    line: Array | None = None  # (n, 3) mm in the target's frame: a thin part, a needle's shaft, of which films render each pixel
 
 
 @dataclass(frozen=True)

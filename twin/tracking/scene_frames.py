@@ -24,7 +24,7 @@ from twin import conditions
 from twin.session import TruthFolder
 from twin.shooting import FrameShooting
 from twin.tracking import film_session
-from twin.tracking.film_session import LOOKS, STILL, Views, in_a_row
+from twin.tracking.film_session import LOOKS, STILL, Seen, in_a_row
 from twin.tracking.mesh_bank import Bank, bank_of, uncovered
 from twin.tracking.rendered_views import Frames
 from twin.tracking.samples import LAMPS, Lighting, Motion, Take, draw
@@ -47,7 +47,7 @@ class SceneFilm:
     times: NDArray[np.int64]  # (m,) ns
     made: Sequence[Take]
     frames: Callable[[], Iterable[Frames]]  # renders them one by one
-    seen: list[Views] = field(default_factory=list)
+    seen: list[Seen] = field(default_factory=list)
 
     @property
     def devices(self) -> dict[str, Device]:

@@ -13,7 +13,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import PROBE, Rig, Target
-from twin.tracking.mesh_bank import Bank, all_uncovered
+from twin.tracking.mesh_bank import Bank, uncovered_share
 from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Held, Lighting, Motion, Print, Take, draw, facing, scene_behind
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import board_corners
@@ -86,7 +86,7 @@ def bodies_take(
         probe = held.pop(PROBE)
         scene = scene_behind(np.append(poses[:, :2, 3].mean(axis=0), poses[:, 2, 3].max()), rng)
         take = replace(drawn, motion=probe.motion, body=probe.body, others=held, scene_from_world=scene)
-        if all_uncovered(bank, take, rig.targets, centres):
+        if uncovered_share(bank, take, rig.targets, centres) == 1:
             return replace(take, lighting=lit_from_the_front(poses[0], rng))
     raise InputError(f"rig: expected both views to have room for the boards of {', '.join(rig.targets)}, found none")
 

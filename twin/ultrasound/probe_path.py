@@ -1,5 +1,5 @@
 """Paths of a hand-led probe: along a surface in contact with it, tilted, trembling; up and down over a tank's bottom; or from
-rest to rest about crossed wires.
+rest to rest about wires.
 """
 
 from typing import Annotated, Literal
@@ -74,6 +74,18 @@ class WirePath(Part):
     tilt_deg: Annotated[float, Field(ge=0, le=80)] = 35.0  # to all sides
     roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0  # about the depth axis, both ways
     miss_mm: NotNegative = 0.2  # standard deviation of the crossing across the image plane: a hand holds it where it shines most
+    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+
+
+class RowPath(Part):
+    """At rest in poses over N-wires, as the probe is calibrated by them: turned to all sides as far as all wires stay in view."""
+
+    kind: Literal["rows"] = "rows"
+    count: Annotated[int, Field(ge=1, le=1000)] = 40  # poses, one image each
+    tilt_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # about the array, to both sides
+    roll_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # about the depth axis, both ways
+    rock_deg: Annotated[float, Field(ge=0, le=60)] = 8.0  # in the image's plane
+    along_mm: NotNegative = 10.0  # both ways along the wires, from their middle
     rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
 
 
@@ -158,11 +170,45 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
     turns, pixels = (part[path.first :] for part in whole)
     beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
     poses = held(body, transducer, turns, pixels, beside)
-    steps = np.rint(np.linspace(0, path.rest_s, int(path.rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
+    return _rests(poses, path.rest_s)
+
+
+def _rests(poses: Array, rest_s: float) -> tuple[Track, NDArray[np.int64]]:
+    """Poses over time at rest in each of some : (count, 4, 4), and the middles of the rests : (count,) ns."""
+    steps = np.rint(np.linspace(0, rest_s, int(rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
     move_s = 1.0  # from one rest to the next; over such a gap no pose is interpolated
-    starts = np.rint(np.arange(path.count) * (path.rest_s + move_s) * 1e9).astype(np.int64)
+    starts = np.rint(np.arange(len(poses)) * (rest_s + move_s) * 1e9).astype(np.int64)
     rests = Track((starts[:, None] + steps).ravel(), np.repeat(poses, len(steps), axis=0))
     return rests, starts + steps[-1] // 2
+
+
+def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
+    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+
+    The middle of all wires appears near the middle of the image.
+
+    Raises
+    ------
+    InputError
+        If the scene has no three wires.
+    """
+    if len(body.wires) < 3:
+        raise InputError(f"path: expected a scene of N-wires, such as scene=n_wires, found {len(body.wires) or 'no'} wires")
+    ends = np.stack([wire.ends for wire in body.wires])
+    along = ends[0, 1] - ends[0, 0]
+    along /= np.linalg.norm(along)
+    rng = np.random.default_rng(seed)
+    tilt, roll, rock, shift = rng.uniform(-1, 1, (4, path.count)) * [
+        [path.tilt_deg], [path.roll_deg], [path.rock_deg], [path.along_mm]
+    ]  # fmt: skip
+    array = np.array([along[1], -along[0], 0.0])  # across wires that lie level
+    upright = np.column_stack([array, [0, 0, 1], np.cross(array, [0, 0, 1])])
+    rotations = upright @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
+    true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
+    middle = np.append((np.array(transducer.image_size) - 1) / 2 * true_scale, 0.0)
+    places = ends.mean(axis=(0, 1)) + shift[:, None] * along
+    poses = np.stack([rigid.transform(turn, place - turn @ middle) for turn, place in zip(rotations, places, strict=True)])
+    return _rests(poses, path.rest_s)
 
 
 def held(body: Body, transducer: Transducer, turns: Array, pixels: Array, beside: Array) -> Array:

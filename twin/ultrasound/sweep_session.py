@@ -21,20 +21,20 @@ from twin.session import Session, TruthFolder, describe
 from twin.ultrasound import bscan_truth, scan_lines
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
-from twin.ultrasound.probe_path import Bob, SurfacePath, WirePath, about_crossing, along_surface, bobbing
+from twin.ultrasound.probe_path import Bob, RowPath, SurfacePath, WirePath, about_crossing, along_surface, bobbing, over_rows
 from twin.ultrasound.timed_sweep import STILL, Clocks, Plan, PoseNoise, moments, plan
 from twin.ultrasound.transducer import Transducer
 
-AnyPath = Annotated[SurfacePath | Bob | WirePath, Field(discriminator="kind")]
+AnyPath = Annotated[SurfacePath | Bob | WirePath | RowPath, Field(discriminator="kind")]
 
 POSES = "sweep.npz"  # in the sweep's own folder of truth
 LABELS = "labels"
-PURPOSES: dict[str, Purpose] = {"wire": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
+PURPOSES: dict[str, Purpose] = {"wire": "probe", "rows": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
 SUPPORTS = ("table", "tank")  # what things lie on or in
 
 
 def plan_sweep(
-    path: SurfacePath | Bob | WirePath,
+    path: SurfacePath | Bob | WirePath | RowPath,
     rig: Rig,
     body: Body,
     transducer: Transducer,
@@ -66,6 +66,9 @@ def plan_sweep(
             _refuse_inside(course, body, transducer)
         case WirePath():
             course, taken = about_crossing(path, body, transducer, path_seed)
+            _refuse_inside(course, body, transducer)
+        case RowPath():
+            course, taken = over_rows(path, body, transducer, path_seed)
             _refuse_inside(course, body, transducer)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 

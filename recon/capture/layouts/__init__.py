@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from recon.capture.images import Size
 from recon.capture.manifest import Purpose
 
+STILLS_HZ = 1.0  # frames/s; taken for stills, each by a press of a key, so that nothing is interpolated between them
+
 
 @dataclass(frozen=True)
 class Known:
     """What such folders don't say, from the command line."""
 
-    camera_hz: float  # frames/s, of frames without time stamps
-    purpose: Purpose  # of the sweep
+    camera_hz: float | None  # frames/s, of frames without time stamps; None where none is given
+    purpose: Purpose | None  # of the sweep; None where none is given
     projector_size: Size  # px
     speed_m_s: float | None  # of sound for which the probe's calibration is right; None where none is given

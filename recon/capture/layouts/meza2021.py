@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon.capture import calibration_files, meza2021_sweep, probe_files, sweep_tables
 from recon.capture.images import Size, image_files, read_grey, write_images
 from recon.capture.layouts import Known
-from recon.capture.manifest import SCANNER, Device
+from recon.capture.manifest import SCANNER, Device, Purpose
 from recon.capture.meza2021_sweep import AuthorsSweep
 from recon.capture.surface_part import SurfaceCapture
 from recon.capture.writer import CaptureWriter
@@ -40,6 +40,7 @@ STEREO_PARAMETERS = "cam1_cam2_params.npz"
 STEREO_XML = "StereoParams.xml"  # the same, as OpenCV FileStorage
 MARKER = "sonotwin-export.json"
 PAIRS = "pairs.csv"
+FILMED_HZ = 30.0  # frames/s; taken where none is given
 
 
 def patterns(projector_size: Size = PROJECTOR_SIZE, lit: bool = True) -> Patterns:
@@ -108,7 +109,7 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
         If nothing of the layout is there, a file is damaged, or parts don't fit together.
     """
     fringes = read_images(folder, known.projector_size) if (folder / "SLdata").is_dir() else None
-    sweep = meza2021_sweep.read_sweep(folder)
+    sweep = meza2021_sweep.read_sweep(folder / meza2021_sweep.FOLDER)
     if fringes is None and sweep is None:
         raise InputError(f"{folder}: expected SLdata/images or USdata/US, as in the rig authors' data set, found neither")
     optics, about_optics = _cameras(folder, known, None if fringes is None else fringes[0], sweep)
@@ -121,7 +122,7 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
         if fringes is not None:
             lines.append(_add_surface(capture, *fringes[:2]))
         if sweep is not None:
-            lines += _add_sweep(capture, sweep, known)
+            lines += add_sweep(capture, sweep, known.camera_hz or FILMED_HZ, known.purpose or "volume")
         if probe is not None:
             calibration, source = probe
             capture.add_probe(calibration)
@@ -161,18 +162,20 @@ def _add_surface(capture: CaptureWriter, images: NDArray, patterns: Patterns) ->
     return f"surface     {len(images)} images, {width}x{height}; mask.png is left out, as a surface finds its own"
 
 
-def _add_sweep(capture: CaptureWriter, sweep: AuthorsSweep, known: Known) -> list[str]:
+def add_sweep(
+    capture: CaptureWriter, sweep: AuthorsSweep, camera_hz: float, purpose: Purpose | None, name: str = "", pairs: str = PAIRS
+) -> list[str]:
     """Write B-scans, frames and poses, at even times, and pairs of poses and crossings; returns lines about them."""
-    times = np.rint(np.arange(sweep.count) * 1e9 / known.camera_hz).astype(np.int64)
-    devices = {name: Device(size=size) for name, size in sweep.sizes.items()}
+    times = np.rint(np.arange(sweep.count) * 1e9 / camera_hz).astype(np.int64)
+    devices = {device: Device(size=size) for device, size in sweep.sizes.items()}
     track = None if sweep.poses is None else Track(times, sweep.poses)
-    capture.add_sweep(dict.fromkeys(devices, times), _images(sweep), devices, track, purpose=known.purpose)
-    held = ", ".join(meza2021_sweep.FOLDERS[name] for name in devices)
-    lines = [f"sweep       {sweep.count} frames of {held}, {'with' if track else 'without'} poses, {known.camera_hz:g} a second"]
+    capture.add_sweep(dict.fromkeys(devices, times), _images(sweep), devices, track, name, purpose)
+    held, rate = ", ".join(sweep.folders.values()), f"{camera_hz:g} a second"
+    lines = [f"{name or 'sweep':11} {sweep.count} frames of {held}, {'with' if track else 'without'} poses, {rate}"]
     if sweep.poses is not None and sweep.crossings is not None:
         rows = ([*pose[:3].ravel().tolist(), *pixel.tolist()] for pose, pixel in zip(sweep.poses, sweep.crossings, strict=True))
-        sweep_tables.write_rows(capture.folder / PAIRS, sweep_tables.PAIRS, rows)
-        lines.append(f"pairs       {sweep.count} of a pose and a crossing, {PAIRS}")
+        sweep_tables.write_rows(capture.folder / pairs, sweep_tables.PAIRS, rows)
+        lines.append(f"pairs       {sweep.count} of a pose and a crossing, {pairs}")
     if sweep.masks:
         lines.append(f"left out    {len(sweep.masks)} masks of B-scans, for which captures have no place")
     return lines

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 # outer diameters, mm [ISO 9626, normal-walled tubing for needles]
 DIAMETERS_MM = {14: 2.11, 15: 1.83, 16: 1.65, 17: 1.47, 18: 1.27, 19: 1.07, 20: 0.91, 21: 0.82, 22: 0.72, 23: 0.64, 25: 0.51}
 THICKNESS_MM = 4.0  # of the board
-HANDLE_MM, RADIUS_MM = 105.0, 8.5  # length and radius of the handle
+HANDLE_MM, RADIUS_MM = 90.0, 8.0  # length and radius of the handle
 BELOW_MM = 8.0  # from the board's back to the handle's rear end
 GRIPPED = 0.8  # of the handle, where thumb and index hold it
 TRIES = 80  # of a hand that leaves the circles free
@@ -29,12 +29,13 @@ TRIES = 80  # of a hand that leaves the circles free
 class Kind(Look):
     """A needle in a hand."""
 
+    IN_A_HAND = True
     kind: Literal["needle"] = "needle"
     gauge: Annotated[int, Field(ge=14, le=25)] = 17
     """thickness of the shaft, by ISO 9626: 14 is 2.1 mm, 25 is 0.5 mm"""
-    length_mm: Annotated[float, Field(ge=10, le=400)] = 120.0
+    length_mm: Annotated[float, Field(ge=10, le=400)] = 90.0
     """from the handle to the tip"""
-    direction: Vector = (0.0, -0.55, -0.83)
+    direction: Vector = (0.0, -0.66, -0.75)
     """from the handle to the tip, in the target's frame; behind the board's face"""
     mark_mm: Positive = 10.0
     """from one mark on the shaft to the next"""
@@ -67,6 +68,11 @@ class Kind(Look):
         """The tip : (3,) mm in the target's frame."""
         start, along = self.axis(target)
         return start + (HANDLE_MM + self.length_mm) * along
+
+    def line_mm(self, target: Target) -> Array:
+        """The shaft's ends : (2, 3) mm."""
+        start, along = self.axis(target)
+        return np.stack([start + HANDLE_MM * along, self.tip_mm(target)])
 
     def parts(self, rng: np.random.Generator, target: Target, stand: Stand) -> tuple[Part, ...]:
         """Board, bracket, handle, shaft, and the hand; none where no hand is found that leaves the circles free."""

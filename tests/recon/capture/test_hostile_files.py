@@ -147,7 +147,7 @@ def test_an_array_that_declares_more_than_it_has_is_refused(tmp_path):
     path = tmp_path / "target_pose.npy"
     path.write_bytes(array().replace(b"(2, 4, 4)", b"(9999999999, 4, 4)")[: len(array())])
     with pytest.raises(InputError, match="expected an array of numbers, found other or damaged data"):
-        meza2021_sweep._rows(path, (4, 4))
+        meza2021_sweep.read_rows(path, (4, 4))
 
 
 def test_a_volume_that_unpacks_to_more_than_its_voxels_is_refused(tmp_path):

@@ -174,6 +174,21 @@ def test_images_and_poses_in_a_file_each(apart, frames, tmp_path):
     assert json.loads((out / "metrics.json").read_text())["frames_placed"] == COUNT - 1
 
 
+def test_identities_of_a_video_file_give_way_to_its_tracker(apart):
+    """As PLUS's recorders fill them in; a frame without a time has no pose, and the others keep theirs."""
+    video, tracker = apart
+    right = sequence_sweep.read_sequence_sweep(video, NAMES, tracker).poses()
+    whole = sequences.read_sequence(video)
+    identities = {"ProbeToTracker": np.tile(np.eye(4), (COUNT, 1, 1))}
+    times_s = whole.times_s.copy()
+    times_s[7] = np.nan
+    valid = whole.valid | {"ProbeToTracker": np.ones(COUNT, bool)}
+    sequences.write_sequence(video, replace(whole, times_s=times_s, transforms=identities, valid=valid))
+    found = sequence_sweep.read_sequence_sweep(video, NAMES, tracker).poses()
+    assert np.isnan(found[7]).all()
+    np.testing.assert_array_equal(np.delete(found, 7, axis=0), np.delete(right, 7, axis=0))
+
+
 @pytest.mark.parametrize("late_s", [0.0002, 0.0013, 0.004])
 def test_a_lost_pose_of_a_file_of_its_own_is_blended_into_none(late_s, apart, tmp_path, caplog):
     """One identity in 60 rows, just after or before an image, made places up to 37 mm off; a stylus is nobody's business."""

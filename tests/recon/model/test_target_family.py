@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from recon.model import circle_layout
-from recon.model.rig import LEAST_PARTED_MM, Rig, parted_mm
+from recon.model.rig import LEAST_PARTED_MM, Rig, Target, parted_mm
 from recon.model.target_family import propose
 from sonotwin import choices
 
@@ -70,3 +70,13 @@ def test_rigs_with_bodies_are_kept_by_what_they_are(rig):
     """Caches keep rigs by their hash: equal ones have one, others mostly another."""
     same, without = Rig.model_validate(rig.model_dump()), rig.model_copy(update={"bodies": {}})
     assert hash(rig) == hash(same) and len({rig, same, without}) == 2
+
+
+def test_shipped_targets_make_rigs_with_the_probes_own_or_in_its_place():
+    """Each design of conf/target is a body beside the probe's target, or its better: MarkerPose's marker has its distances."""
+    bodies = choices.read_rig("three_bodies").bodies
+    for name in ("needle", "patient"):
+        assert bodies[name].model_dump() == Target.model_validate(choices.read("target", name)).model_dump()
+    marker = Target.model_validate(choices.read("target", "markerpose"))
+    assert parted_mm(marker, choices.read_rig().target) == pytest.approx(0, abs=1e-9)
+    Rig.model_validate(choices.read_rig("three_bodies").model_dump() | {"target": marker.model_dump()})

@@ -12,9 +12,13 @@ import numpy as np
 import pytest
 
 from recon.capture import manifest, probe_files, sweep_tables
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import NAMES
 from recon.probe_calibration import point_calibration, repeatability
+from recon.session import probe_runs_step
+from recon.session.probe_step import Settings
+from sonotwin import choices
 from sonotwin.cli import main
 from tests.recon import bscans, probe_motions, sweep_sets
 
@@ -215,3 +219,12 @@ def test_runs_of_other_image_sizes_are_none_of_one_scanner(rig, pairs, tmp_path,
         capsys, listed([pairs[0], capture]), "rig.probe.image_size=[400,500]", "temperature_c=22", f"out={tmp_path / 'o'}"
     )
     assert found == f"{capture}: expected B-scans of 400x500 px as before, found 321x408"
+
+
+def test_runs_of_another_phantom_are_compared_by_their_results(tmp_path):
+    """Wires in rows show no one point: their captures are refused, their results are not."""
+    (tmp_path / "pairs.csv").write_text("x", encoding="utf-8")
+    runs = tmp_path / "pairs.csv", tmp_path / "probe.yaml"
+    settings = Settings(rig=choices.read_rig(), runs=runs, phantom="n_wires", wires=tmp_path / "w.xml")
+    with pytest.raises(InputError, match=r"runs: expected results of before, as n_wires.*pairs\.csv"):
+        list(probe_runs_step.read_runs(settings, settings.rig.probe))

@@ -19,7 +19,7 @@ from twin.conditions import Motion
 from twin.evaluation import track_errors
 from twin.session import Session
 from twin.tracking import film_session
-from twin.tracking.mesh_bank import uncovered
+from twin.tracking.mesh_bank import uncovered, uncovered_share
 from twin.tracking.rendered_views import Frames, white_radiance
 from twin.tracking.target_truth import view_truth
 
@@ -31,7 +31,7 @@ def config() -> Config:
 
 @pytest.fixture(scope="module")
 def bank(config):
-    return film_session.make_bank(config.rig, config.seed)
+    return film_session.make_bank(config.rig, ranges(), config, config.seed)
 
 
 @pytest.fixture(scope="module")
@@ -178,3 +178,89 @@ def test_a_rendered_film_is_tracked(tmp_path, config):
         assert found.found, found.pose.reason
         error = np.linalg.norm(found.pose.world_from_target[:3, 3] - true[:3, 3])
         assert error < min(4 * np.sqrt(np.trace(found.pose.covariance[3:, 3:])), 0.2)
+
+
+@pytest.fixture(scope="module")
+def three():
+    """Config, bank and takes of a film of a rig with a needle and a patient."""
+    config = load("film", ["rig=three_bodies", "out=unused", "frames=24"], Config)
+    bank = film_session.make_bank(config.rig, ranges(), config, config.seed)
+    return config, bank, film_session.takes(bank, config.rig, ranges(), config, config.seed)
+
+
+def test_three_bodies_stand_side_by_side(three):
+    """Most pairs show all circles of all bodies, none behind another body, hand or cable; only the probe leaves the view."""
+    config, bank, made = three
+    eyes = np.array([device.optics.camera().centre for device in made[0].cameras])
+    free = [uncovered_share(bank, take, config.rig.targets, eyes) for take in made]
+    inside = np.array([
+        [view_truth(held, device, 0.0, config.rig.targets[name]).inside.all() for device in take.cameras]
+        for take in made for name, held in take.held.items()
+    ]).reshape(len(made), 3, 2)  # fmt: skip
+    assert np.mean(np.array(free) > 0.999) > 0.8 and inside[:, 1:].all() and inside.all(axis=(1, 2)).mean() > 0.5
+
+
+def test_the_patient_breathes_and_the_needle_is_held(three):
+    """By millimetres on a post, by a hand's own sway and turns in a hand."""
+    _, _, made = three
+    moves = {}
+    for name in ("needle", "patient"):
+        poses = np.array([take.others[name].motion.world_from_target for take in made])
+        moves[name] = np.ptp(poses[:, :3, 3], axis=0).max()
+        turns = [rigid.difference(poses[0], pose)[:3] for pose in poses]
+        assert (np.abs(turns).max() > 0.01) == (name == "needle")
+    assert 0.2 < moves["patient"] < 2 < 6 < moves["needle"]
+
+
+def test_the_probe_is_the_one_of_a_film_without_others(three, made):
+    """Its path and its print are the same; light may come from farther off."""
+    for take, alone in zip(three[2], made, strict=True):
+        assert (take.motion.world_from_target == alone.motion.world_from_target).all()
+        assert take.face.paper == alone.face.paper
+
+
+def test_truth_of_further_bodies_is_read_by_name(three, tmp_path):
+    config, _, made = three
+    few = config.model_copy(update={"frames": 2})
+    session = Session(tmp_path, "sweep", {"seed": 0}, devices=CAMERAS)
+
+    def blank(take):
+        views = {
+            name: tuple(view_truth(held, device, 0.0, config.rig.targets[name]) for device in take.cameras)
+            for name, held in take.held.items()
+        }
+        image = np.zeros((1024, 1280), np.uint8)
+        return Frames((image, image), views.pop("probe"), others=views)
+
+    film_session.write_session(session, config.rig, config.rig, few, made[:2], map(blank, made[:2]))
+    for name in config.rig.targets:
+        truth = track_errors.read_truth(tmp_path / "truth", body=name)
+        assert (truth.poses == [take.held[name].motion.world_from_target for take in made[:2]]).all()
+    with np.load(tmp_path / "truth/sweep/bodies/needle.npz") as needle:
+        assert needle["tip_mm"] == pytest.approx(config.look("needle").tip_mm(config.rig.bodies["needle"]))
+
+
+def test_two_bodies_of_one_design_make_a_film():
+    """As a rig has them that says so: a second target like the probe's, a board on a post."""
+    rig = takes.rig().model_dump()
+    rig["bodies"] = {"double": rig["target"] | {"unusual": True}}
+    config = load("film", ["out=unused", "frames=2"], Config)
+    config = Config.model_validate(config.model_dump() | {"rig": rig})
+    bank = film_session.make_bank(config.rig, ranges(), config, 1)
+    made = film_session.takes(bank, config.rig, ranges(), config, 1)
+    assert list(made[0].held) == ["probe", "double"] and config.look("double").kind == "board"
+
+
+def test_what_is_wrong_with_bodies_is_said_in_one_line(tmp_path, capsys):
+    def complaint(*fields: str) -> str:
+        assert main(["film", f"out={tmp_path / 'film'}", *fields]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("sonotwin: ")
+
+    told = complaint("bodies.needle={look: {kind: needle}}")
+    assert "bodies: expected names of the rig's further bodies (none, such as rig=three_bodies has), found needle" in told
+    told = complaint("rig=three_bodies", "bodies.needle.look={kind: needle, gauge: 24}")
+    assert "bodies.needle.look" in told and "gauge" in told and "expected one of 14" in told
+    near = "bodies.patient={path: {places_mm: [[0,0,50],[1,0,50],[0,1,50]]}}"
+    assert complaint("rig=three_bodies", near).startswith("bodies.patient.path: expected places at least 100 mm")
+    assert not (tmp_path / "film").exists()

@@ -76,6 +76,7 @@ def test_apart_each_is_rendered_as_if_it_were_alone(bank):
         np.testing.assert_allclose(together, by_itself, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_films_picture_is_that_of_each_alone(bank):
     """Digital numbers of the circles, noise and all."""
     take = lamp_at(both(facing(20.0, (-70.0, -20.0, 650.0)), BESIDE), (30.0, 0.0, 0.0))

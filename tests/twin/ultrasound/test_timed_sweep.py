@@ -10,7 +10,7 @@ from recon.probe_calibration import latency
 from scenes.catalogue import build_scene
 from twin.conditions import Motion, given, trembling
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.probe_path import Bob, Hand, SurfacePath, along_surface, bobbing, top
+from twin.ultrasound.probe_path import Bob, Hand, RowPath, SurfacePath, along_surface, bobbing, over_rows, top
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise, moments, plan, sweep
 
 STILL = Hand(shift_mm=0.0, turn_deg=0.0)
@@ -100,3 +100,20 @@ def test_the_target_moves_over_an_exposure_as_the_path_leads_it(rig):
     assert moved[1:-1] == pytest.approx(np.tile([0.2, 0, 0], (len(moved) - 2, 1)))
     assert moved[0] == pytest.approx([0.1, 0, 0]) and np.isfinite(moved).all(), "at the start it was at rest before"
     assert at_once == pytest.approx((later + earlier)[:, :4, :4] / 2, abs=0.06)
+
+
+def test_all_n_wires_stay_in_view(cylinders, clean):
+    """Where each wire meets the image's plane, by line and plane, lies in the image of the slower water."""
+    wired = body(build_scene({"kind": "n_wires", "turn_deg": 25.0}))
+    ends = np.stack([wire.ends for wire in wired.wires])
+    course, taken = over_rows(RowPath(), wired, clean)
+    scale = np.array(clean.scale_mm_per_px) * [1.0, wired.medium.speed / clean.assumed_speed]
+    inside = []
+    for pose in tracks.poses_at(course, taken, 0.0):
+        front, back = np.moveaxis(rigid.apply(rigid.invert(pose), ends), 1, 0)
+        places = front - front[:, 2:] / (back - front)[:, 2:] * (back - front)
+        pixels = places[:, :2] / scale
+        inside.append(((pixels > 0) & (pixels < np.array(clean.image_size) - 1)).all())
+    assert np.mean(inside) > 0.9
+    with pytest.raises(InputError, match="expected a scene of N-wires, such as scene=n_wires, found no wires"):
+        over_rows(RowPath(), cylinders, clean)

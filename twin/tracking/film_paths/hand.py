@@ -1,5 +1,6 @@
 """The target led by a hand through places, as when a probe is brought from one to the next."""
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -25,16 +26,16 @@ class Kind(FilmPath):
     turn_deg: NotNegative = 6.0  # standard deviation about each axis, from place to place
     unsteady_mm: NotNegative = 1.0  # of the places
 
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL) -> Way:
+    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
         """Lead it as steadily as the path demands."""
-        rng = np.random.default_rng([seed, 2])
+        rng = np.random.default_rng([seed, 2, *body])
         places = np.array(self.places_mm, float)
         places = places + self.unsteady_mm * rng.standard_normal(places.shape)
         turns = np.deg2rad(self.turn_deg) * rng.standard_normal(places.shape)
         times = np.linspace(0, self.seconds, len(places) + 1)
         middle, turn = (CubicSpline(times, np.vstack([rows, rows[:1]]), bc_type="periodic") for rows in (places, turns))
         first = facing(eyes - places.mean(axis=0), self.roll_deg)
-        return Way(middle, turn, first, circle_layout.middle(target), conditions.trembling(errors, seed))
+        return Way(middle, turn, first, circle_layout.middle(target), conditions.trembling(errors, seed, *body))
 
     @property
     def room_mm(self) -> Array:

@@ -1,6 +1,6 @@
 """The target on a tool whose tip rests in a dimple, tilted to all sides and turned: what a tip is calibrated from."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -31,13 +31,13 @@ class Kind(FilmPath):
     tilt_deg: Annotated[float, Field(ge=0, le=60)] = 25.0  # at most, about each of two axes across the shaft
     turn_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # at most, about the shaft, both ways
 
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL) -> Way:
+    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
         """Lead it about the tip; the seed tells where it begins."""
         middle, tip = circle_layout.middle(target), np.array(self.tip_mm, float)
         first = facing(eyes - np.array(self.middle_mm, float), self.roll_deg)
         shaft = first @ (middle - tip) / np.linalg.norm(middle - tip)
         across = np.linalg.svd(shaft[None])[2][1:]
-        phases = np.random.default_rng([seed, 2]).uniform(0, 2 * np.pi, 3)
+        phases = np.random.default_rng([seed, 2, *body]).uniform(0, 2 * np.pi, 3)
         parts = np.sin(2 * np.pi * np.linspace(0, 1, STEPS + 1)[:, None] * ROUNDS + phases)
         tilts = Rotation.from_rotvec(np.deg2rad(self.tilt_deg) * parts[:, :2] @ across)
         turned = (tilts * Rotation.from_rotvec(np.deg2rad(self.turn_deg) * parts[:, 2:] * shaft)).as_rotvec()
@@ -46,7 +46,7 @@ class Kind(FilmPath):
         dimple = np.tile(self.dimple_mm(target, eyes), (STEPS + 1, 1))
         rest = CubicSpline(times, dimple, bc_type="periodic")
         still = errors.model_copy(update={"tremor_mm": 0.0})
-        return Way(rest, CubicSpline(times, turned, bc_type="periodic"), first, tip, conditions.trembling(still, seed))
+        return Way(rest, CubicSpline(times, turned, bc_type="periodic"), first, tip, conditions.trembling(still, seed, *body))
 
     def dimple_mm(self, target: Target, eyes: Array) -> Array:
         """Place of the tip in the world : (3,) mm."""

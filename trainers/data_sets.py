@@ -1,0 +1,59 @@
+"""Data sets of all kinds as one: shards of `sonotwin dataset`, and MarkerPose's folders after them."""
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from recon.errors import InputError
+from trainers import markerpose_layout, shard_reader
+from trainers.shard_reader import Data, Patches, Tell, Views
+from trainers.stored_images import StoredImages
+
+Some = TypeVar("Some", bound=Data)
+
+
+def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Views:
+    """Views of some folders; see `trainers.shard_reader.read_views`.
+
+    Raises
+    ------
+    InputError
+        Also if MarkerPose's folders, of three circles, stand beside a set of others.
+    """
+    shards, others = _kinds(folders)
+    parts = [shard_reader.read_views(shards, tell, partial)] if shards else []
+    return joined([*parts, *(markerpose_layout.read_views(folder) for folder in others)])
+
+
+def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Patches:
+    """Patches of some folders; otherwise as `read_views`."""
+    shards, others = _kinds(folders)
+    parts = [shard_reader.read_patches(shards, tell, partial)] if shards else []
+    return joined([*parts, *(markerpose_layout.read_patches(folder) for folder in others)])
+
+
+def joined(parts: Sequence[Some]) -> Some:
+    """Samples of all parts, one after the other; their images may lie in files of any kind."""
+    first, *others = parts
+    for part in others:
+        columns = {field.name: _stacked(getattr(first, field.name), getattr(part, field.name)) for field in fields(first)}
+        first = replace(first, **columns | {"sample": np.append(first.sample, part.sample + first.sample[-1] + 1)})
+    return first
+
+
+def _stacked(one: StoredImages | np.ndarray, other: StoredImages | np.ndarray) -> StoredImages | np.ndarray:
+    if isinstance(one, StoredImages) and isinstance(other, StoredImages):
+        return one.followed_by(other)
+    return np.concatenate([one, other])
+
+
+def _kinds(folders: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Folders with shards, and MarkerPose's."""
+    others = [folder for folder in folders if markerpose_layout.recognises(folder)]
+    shards = [folder for folder in folders if folder not in others]
+    if others and shards and (circles := shard_reader.circles_of(shards)) != 3:
+        raise InputError(f"{others[0]}: expected samples of {circles} circles, as in {shards[0]}, found MarkerPose's, of three")
+    return shards, others
