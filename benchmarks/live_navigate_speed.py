@@ -55,7 +55,7 @@ def navigated(setup: Setup) -> Figures:
         sources = navigate.sources_of(config)
         tracker = navigate.tracker_of(config, sources.sizes, sources.bits)
         probe = navigate.probe_of(config)
-        scene = still_scene.read_scene(None, None, tracker.target, probe, sources.width)
+        scene = still_scene.read_scene(None, None, config.rig.target, probe, sources.width)
         masses = {name: trimesh.creation.icosphere(4, 8.0).apply_translation(centre) for name, centre in MASSES.items()}
         view = BrowserView(scene, PORT)
         warm_up(tracker)

@@ -33,7 +33,7 @@ def overrides(verb: str, fields: Sequence[str], inputs: Sequence[str]) -> Iterat
     fields : of a valid command
     inputs : names of those among them that are files or folders to be read
     """
-    for way, value in _leaves(config.compose(verb, fields)):
+    for way, value in _leaves(config.compose(verb, fields, config.fields_of(verb))):
         if way not in {"out", *inputs, *FREE}:
             yield from (f"{way}={nonsense}" for nonsense in NONSENSE.get(type(value), ()))
     yield from (

@@ -46,7 +46,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "describe": {""},
     "reconstruct": {"", "optics/optics.yaml"},
 }
-WRITTEN = ("out", "document", "log")  # fields that name what is written; other paths are read
+WRITTEN = ("out", "document", "log", "record")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
     "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture"},
     "captures.md": {
@@ -80,7 +80,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     | {"examples_ybr_color.dcm"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},
     "live-navigate.md": {"session/capture", "result/surface/surface.ply", "result/masses/scan"}
-    | {"result/drift/optics.yaml", "result/probe/probe.yaml"},
+    | {"result/drift/optics.yaml", "result/probe/probe.yaml", "reference.csv"},
     "rig-software.md": {"board", "surface"},
     "tracking.md": {"session", "probe.yaml"},
 }

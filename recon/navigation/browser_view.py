@@ -1,4 +1,4 @@
-"""A view in the browser: skin, masses, probe and B-scan in space, with distances, latency and what is wrong, as they come."""
+"""A view in the browser: skin, masses, probe, tools and B-scan in space, with distances, latency and faults, as they come."""
 
 import socket
 from collections.abc import Sequence
@@ -15,18 +15,22 @@ from scipy.spatial.transform import Rotation
 from recon.errors import InputError
 from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
-from recon.navigation import moment_figures
+from recon.navigation import moment_figures, tool_figures
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.publishing import Moment, StillScene
+from recon.navigation.publishing import BodyAt, Moment, StillScene
+from recon.navigation.tool_figures import Alarms
 from recon.own_requests import LOOPBACK
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
+TOOL, PLAN = (90, 205, 255), (120, 230, 120)  # colours of tools, in space and in the B-scan, and of the planned path
+PLAN_MM, AIM_MM = 0.5, 2.0  # radii of the path's line and of its aim
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
 FONT, NAME_GAP_PX = (cv2.FONT_HERSHEY_SIMPLEX, 0.5), 4  # of the names, and between them and the outlines
+MARK_PX, FAR_PX = 5, 1e4  # half a crossing's mark; from a picture, beyond which nothing is drawn
 PANEL_PX = 290  # width of the figures, beside the view
 ASIDE = np.array([-0.5, -0.6, -0.7]) / np.sqrt(1.1)  # direction from the scene to the viewer: camera 1's side, from above
 FIELD_RAD, DISTANCE = 0.8, 3.0  # of the view, upright; and from where, as a multiple of the scene's half diagonal
@@ -38,7 +42,7 @@ class BrowserView:
 
     name = "browser"
 
-    def __init__(self, scene: StillScene, port: int = 8080, host: str = LOOPBACK) -> None:
+    def __init__(self, scene: StillScene, port: int = 8080, host: str = LOOPBACK, alarms: Alarms | None = None) -> None:
         """Serve the page of a scene; a port of 0 takes any that is free.
 
         Raises
@@ -54,7 +58,7 @@ class BrowserView:
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
-        self._masses = tuple(scene.masses)
+        self._scene, self._alarms = scene, alarms or Alarms()
         with ExitStack() as stack:
             with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
                 self._server = viser.ViserServer(host=host, port=free, label="sonotwin", verbose=False)
@@ -62,7 +66,8 @@ class BrowserView:
             self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
             self._server.gui.main_panel.dock_right()  # beside the view, where it covers nothing
             self._server.gui.main_panel.set_width(PANEL_PX)
-            self._bodies = _add_scene(self._server, scene)
+            self._probe = _add_scene(self._server, scene)
+            self._tools = {name: _add_tool(self._server, name, mesh) for name, mesh in scene.shapes.items()}
             self._server.gui.add_html(moment_figures.STYLE)
             self._figures, self._written = self._server.gui.add_html("waiting for the first frames"), 0.0
             stack.pop_all()  # it is open
@@ -76,22 +81,21 @@ class BrowserView:
         """Show a moment; see `Publisher`."""
         figures_s = 0.1  # between two sets of figures, and pictures under them: faster ones can't be read
         with self._server.atomic():
-            self._show_probe(moment.world_from_target)
+            _show(self._probe, moment.world_from_target)
+            for name, handle in self._tools.items():
+                _show(handle, tool_figures.body_of(moment, name).world_from_body)
             self._show_scan(moment.scan, moment.distances)
             if monotonic() - self._written > figures_s:  # figures and picture of one moment
                 self._written = monotonic()
-                self._figures.content = moment_figures.html_of(moment, self._masses, self._picture)
+                picture = None if self._picture is None else with_tools(self._picture, moment.bodies)
+                tools = tool_figures.html_of(moment, self._scene, self._alarms)
+                self._figures.content = moment_figures.html_of(moment, self._scene.masses, picture, tools)
         self._server.flush()
 
     def close(self) -> None:
         """End."""
         with redirect_stdout(StringIO()):
             self._server.stop()
-
-    def _show_probe(self, world_from_target: Array | None) -> None:
-        self._bodies.visible = world_from_target is not None
-        if world_from_target is not None:
-            self._bodies.wxyz, self._bodies.position = turn_of(world_from_target), world_from_target[:3, 3] * M
 
     def _show_scan(self, scan: PlacedScan | None, distances: Sequence[MassDistance]) -> None:
         if scan is not self._shown:
@@ -129,6 +133,30 @@ def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:
     return picture
 
 
+def with_tools(picture: Picture, bodies: Sequence[BodyAt]) -> Picture:
+    """A copy of a B-scan : (h, w, 3) with the part of each tool's shaft that lies in its slice, and where the shaft crosses it.
+
+    A cross stands for a shaft that will cross ahead of its tip, a ring for one that has crossed.
+    """
+    drawn = picture.copy()
+    for body in bodies:
+        plane = None if body.figures is None else body.figures.plane
+        if plane is None:
+            continue
+        for colour, thickness in ((IN_SPACE.ink[:3], 3), (TOOL, 1)):
+            if plane.seen is not None:
+                first, last = (tuple(map(int, end)) for end in np.rint(np.clip(plane.seen, -FAR_PX, FAR_PX)))
+                cv2.line(drawn, first, last, colour, thickness, cv2.LINE_AA)
+            if plane.crossing is not None and plane.crossing.in_image:
+                u, v = np.rint(plane.crossing.pixel).astype(int).tolist()
+                if plane.crossing.ahead_mm >= 0:
+                    cv2.drawMarker(drawn, (u, v), colour, cv2.MARKER_TILTED_CROSS, 2 * MARK_PX, thickness, cv2.LINE_AA)
+                else:
+                    cv2.circle(drawn, (u, v), MARK_PX, colour, thickness, cv2.LINE_AA)
+                cv2.putText(drawn, body.name, (u + 2 * MARK_PX, v + MARK_PX), *FONT, colour, thickness, cv2.LINE_AA)
+    return drawn
+
+
 def name_place(name: str, outline: NDArray[np.int32], shape: tuple[int, ...]) -> tuple[int, int]:
     """Lower left corner of a name in a picture of a shape (h, w): over the outline : (n, 2) px, else under it, else within."""
     (width, height), below = cv2.getTextSize(name, *FONT, 1)
@@ -155,6 +183,11 @@ def _add_scene(server, scene: StillScene):
         _add_mesh(server, f"/masses/{name}", mesh, IN_SPACE.mass[:3])
         top = np.array([mesh.bounds[:, 0].mean(), mesh.bounds[0, 1], mesh.bounds[:, 2].mean()])  # y of the world is down
         server.scene.add_label(f"/names/{name}", name, position=top * M, anchor="bottom-center", font_screen_scale=0.8)
+    if scene.plan is not None:
+        entry, aim = scene.plan
+        _add_mesh(server, "/plan/path", trimesh.creation.cylinder(PLAN_MM, segment=scene.plan, sections=12), PLAN)
+        _add_mesh(server, "/plan/aim", trimesh.creation.icosphere(2, AIM_MM).apply_translation(aim), PLAN)
+        server.scene.add_label("/plan/entry", "entry", position=entry * M, anchor="bottom-center", font_screen_scale=0.8)
     handle = server.scene.add_frame("/probe", show_axes=False, visible=False)
     for name, mesh, colour in (("body", scene.probe, IN_SPACE.body[:3]), ("circles", scene.circles, IN_SPACE.ink[:3])):
         if mesh is not None:
@@ -172,6 +205,21 @@ def _add_scene(server, scene: StillScene):
     server.initial_camera.up = (0.0, -1.0, 0.0)
     server.initial_camera.fov = FIELD_RAD
     return handle
+
+
+def _add_tool(server, name: str, mesh: trimesh.Trimesh):
+    """Add a tool; returns its handle."""
+    handle = server.scene.add_frame(f"/tools/{name}", show_axes=False, visible=False)
+    _add_mesh(server, f"/tools/{name}/shape", mesh, TOOL)
+    server.scene.add_label(f"/tools/{name}/name", name, anchor="bottom-center", font_screen_scale=0.8)
+    return handle
+
+
+def _show(handle, world_from_body: Array | None) -> None:
+    """Show a body where it is, or hide it."""
+    handle.visible = world_from_body is not None
+    if world_from_body is not None:
+        handle.wxyz, handle.position = turn_of(world_from_body), world_from_body[:3, 3] * M
 
 
 def _add_mesh(

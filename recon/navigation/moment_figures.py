@@ -28,6 +28,8 @@ STYLE = f"""<style>
 .figures .number {{ width: 40%; text-align: right; padding-right: 1.2em; white-space: nowrap; overflow-wrap: normal; }}
 .figures img {{ display: block; width: 100%; }}
 .figures .cut td {{ color: rgb(255, 210, 60); }}
+.figures .alarm td {{ color: rgb(255, 125, 110); font-weight: 600; }}
+.figures .state {{ height: 2.8em; }}
 @media (max-width: {NARROW}) {{
   .mantine-Paper-root:has(.figures) {{ max-height: 40% !important; width: 17em !important; }}
   [style*="width: 20em"]:has(.figures) {{ width: 17em !important; }}
@@ -35,14 +37,18 @@ STYLE = f"""<style>
 </style>"""
 
 
-def html_of(moment: Moment, masses: Iterable[str], picture: NDArray[np.uint8] | None = None) -> str:
-    """The figures of a moment; each mass has its row, whether there is a distance or none. Under them its B-scan : (h, w, 3)."""
+def html_of(moment: Moment, masses: Iterable[str], picture: NDArray[np.uint8] | None = None, tools: str = "") -> str:
+    """The figures of a moment; each mass has its row, whether there is a distance or none. Under them its B-scan : (h, w, 3).
+
+    tools : tables of `recon.navigation.tool_figures`
+    """
     tracked = "Tracking" if moment.world_from_target is not None else "Not tracking"
     parts = [f"<p><b>{tracked}:</b> {escape(moment.state)}</p>"]
     near = {each.name: each for each in moment.distances}
     if rows := [_row_of_mass(name, near.get(name)) for name in masses]:
         heads = '<th>mass</th><th class="number">plane, mm</th><th>cut</th>'
         parts.append(f"<table><tr>{heads}</tr>{''.join(rows)}</table>")
+    parts.append(tools)
     parts.append(f"<table>{''.join(_row(*row) for row in _states(moment))}</table>")
     parts += [f"<p><b>Device:</b> {escape(trouble)}</p>" for trouble in moment.troubles]
     if picture is not None:

@@ -18,35 +18,41 @@ from recon.navigation import mass_distances
 from recon.navigation.feeds import Device, Feed
 from recon.navigation.frame_pairs import FramePair, Pairing
 from recon.navigation.mass_distances import Body, MassDistance
-from recon.navigation.newest import Newest
+from recon.navigation.moving_bodies import MovingBodies, Placed, state_of
+from recon.navigation.newest import Every, Newest
 from recon.navigation.placed_scans import PlacedScan, ScanPlacing
-from recon.navigation.publishing import Moment, Outlet, Publisher
+from recon.navigation.publishing import BodyAt, Moment, Outlet, Publisher
+from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker, Tracking
 
 NO_POSE = np.full((4, 4), np.nan)
 FACING = rigid.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 650.0])  # a target before camera 1
 
 
-def warm_up(tracker: Tracker) -> None:
+def warm_up(tracker: Tracker | BodyTracker) -> None:
     """Run all that a tracker's first frames need once, on dark ones: it may have to be compiled, which takes some seconds."""
-    left, right = (np.zeros(camera.size[::-1], np.uint8) for camera in tracker.cameras)
-    tracker.remember(FACING, 0.0)
+    each = list(tracker.trackers.values()) if isinstance(tracker, BodyTracker) else [tracker]
+    left, right = (np.zeros(camera.size[::-1], np.uint8) for camera in each[0].cameras)
+    for one in each:
+        one.remember(FACING, 0.0)
     tracker.step(left, right, 0.01)
     tracker.forget()
 
 
 @dataclass
 class Navigator:
-    """Follows the probe live. `start`, then `stop`; the first publisher's latency is the one that is told."""
+    """Follows the probe live, and further bodies. `start`, then `stop`; the first publisher's latency is the one that is told."""
 
     cameras: tuple[Device, Device]
     scanner: Device | None
-    tracker: Tracker
+    tracker: Tracker | BodyTracker
     probe: ProbeCalibration
     lag_s: float
     bodies: dict[str, Body]
     publishers: Sequence[Publisher]
     again_s: float = 1.0  # until a device that was lost is opened again
+    moving: MovingBodies = field(default_factory=lambda: MovingBodies({}))  # of a tracker of several bodies
+    recorders: Sequence[Publisher] = ()  # that get every moment
     outlets: list[Outlet] = field(init=False)
     feeds: list[Feed] = field(init=False)
     pairs: Newest[FramePair] = field(default_factory=Newest, init=False)
@@ -57,6 +63,7 @@ class Navigator:
         pairing = Pairing(self.pairs)
         self._placing = ScanPlacing(self.probe, self.lag_s)
         self.outlets = [Outlet(publisher) for publisher in self.publishers]
+        self.outlets += [Outlet(recorder, newest=Every()) for recorder in self.recorders]
         self.feeds = [
             Feed(self.cameras[0], lambda arrival: pairing.add(0, arrival), self.again_s),
             Feed(self.cameras[1], lambda arrival: pairing.add(1, arrival), self.again_s),
@@ -90,28 +97,42 @@ class Navigator:
         number, scan, distances = 0, None, ()
         stale_ns = 500_000_000  # beyond the lag, after which a B-scan is shown no more
         wait_s = 0.5  # for a pair of frames, until it is told that there are none
-        while not self._stopped.is_set():
+        while True:
             pair = self.pairs.take(wait_s)
+            if self._stopped.is_set():
+                return
             if pair is None:
                 self._publish(Moment(number, monotonic_ns(), None, "no frames of both cameras", troubles=self._troubles()))
                 continue
             number += 1
             found = self.tracker.step(pair.left.frame.image, pair.right.frame.image, pair.exposed_ns * 1e-9)
-            self._placing.add_pose(pair.exposed_ns, found.pose.world_from_target if found.found else NO_POSE)
+            placed = self._placed(found, pair.exposed_ns)
+            self._placing.add_pose(pair.exposed_ns, NO_POSE if placed.world_from_target is None else placed.world_from_target)
             if (newer := self._placing.newest()) is not None:
                 scan, distances = newer, mass_distances.distances(self.bodies, newer)
             elif scan is not None and pair.exposed_ns - scan.taken_ns > stale_ns + self.lag_s * 1e9:
                 scan, distances = None, ()
-            self._publish(self._moment(number, pair, found, scan, distances))
+            bodies = self.moving.measure(placed, scan)
+            self._publish(self._moment(number, pair, placed, scan, distances, bodies))
+
+    def _placed(self, found: Tracking | dict[str, Tracking], exposed_ns: int) -> Placed:
+        if isinstance(found, dict):
+            return self.moving.place(found, exposed_ns)
+        return Placed(found.pose.world_from_target if found.found else None, state_of(found))
 
     def _moment(
-        self, number: int, pair: FramePair, found: Tracking, scan: PlacedScan | None, distances: tuple[MassDistance, ...]
+        self,
+        number: int,
+        pair: FramePair,
+        placed: Placed,
+        scan: PlacedScan | None,
+        distances: tuple[MassDistance, ...],
+        bodies: tuple[BodyAt, ...],
     ) -> Moment:
-        pose = found.pose.world_from_target if found.found else None
-        beside = ", beside a second one of its design" if found.others else ""
-        state = f"target {found.how}{beside}" if found.found else f"target not found: {found.pose.reason}"
+        pose, state = placed.world_from_target, placed.state
         latency = self.outlets[0].latencies.figures() if self.outlets else None
-        return Moment(number, pair.exposed_ns, pose, state, scan, distances, self._troubles(), latency)
+        frame_ns = pair.left.frame.time_ns
+        return Moment(number, pair.exposed_ns, pose, state, scan, distances, self._troubles(), latency, bodies, frame_ns)
 
     def _troubles(self) -> tuple[str, ...]:
         return tuple(feed.trouble for feed in self.feeds if feed.trouble is not None)

@@ -13,9 +13,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.errors import InputError
+from recon.model.tip import Tip
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.newest import Newest
 from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.tool_distances import TipFigures
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -24,13 +26,16 @@ WAIT_S = 0.2  # for a moment, before looking whether to end
 
 @dataclass(frozen=True, eq=False)
 class StillScene:
-    """What is known before, in the world, but for the probe, which is in the target's frame."""
+    """What is known before, in the world, but for the probe and the tools, which are in their targets' frames."""
 
     target_from_image: Array  # (4, 4), mm
     skin: trimesh.Trimesh | None = None
     masses: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)
     probe: trimesh.Trimesh | None = None
     circles: trimesh.Trimesh | None = None  # of the target
+    tools: Mapping[str, Tip | None] = field(default_factory=dict)  # by the body's name; None of one whose tip isn't calibrated
+    shapes: Mapping[str, trimesh.Trimesh] = field(default_factory=dict)  # of the tools
+    plan: Array | None = None  # (2, 3) mm, the planned path's entry and aim
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,17 @@ class Latency:
     median_ms: float
     high_ms: float  # 99 of 100 are below
     rate_hz: float
+
+
+@dataclass(frozen=True)
+class BodyAt:
+    """A body besides the probe at a moment."""
+
+    name: str
+    state: str  # of tracking: how it was found, or why it wasn't
+    world_from_body: Array | None = None  # (4, 4) mm; None where it isn't known
+    camera_from_body: Array | None = None  # (4, 4) mm, as the cameras see it, wherever the patient is
+    figures: TipFigures | None = None  # of a tool whose tip is calibrated
 
 
 @dataclass(frozen=True)
@@ -54,6 +70,13 @@ class Moment:
     distances: tuple[MassDistance, ...] = ()  # of that B-scan
     troubles: tuple[str, ...] = ()  # of devices, a line each
     latency: Latency | None = None  # of the moments before
+    bodies: tuple[BodyAt, ...] = ()  # besides the probe
+    frame_ns: int | None = None  # of camera 1's frame, by its own clock; None without frames
+
+    @property
+    def places_any(self) -> bool:
+        """Whether the probe or another body is placed."""
+        return self.world_from_target is not None or any(body.world_from_body is not None for body in self.bodies)
 
     @property
     def status(self) -> str:
@@ -122,7 +145,7 @@ class Outlet:
     def stop(self) -> None:
         """End, and close the publisher."""
         self._ended = True
-        self.newest.close()
+        self.newest.close()  # what is left in it is still published
         if self._thread is not None:
             self._thread.join()
         self.publisher.close()
@@ -140,13 +163,15 @@ class Outlet:
 
     def _publish_all(self) -> None:
         shown = None
-        while not self._ended:
+        while True:
             moment = self.newest.take(WAIT_S)
             if moment is None:
+                if self._ended:
+                    return
                 continue
             self.publisher.publish(moment)
             now = monotonic_ns()
-            if moment.world_from_target is not None:
+            if moment.places_any:
                 self.latencies.add(moment.exposed_ns, now)
             if moment.scan is not None and moment.scan is not shown:
                 shown = moment.scan

@@ -1,13 +1,17 @@
-"""Follow the probe live: the B-scan in place, skin and masses around it, in the browser and in 3D Slicer.
+"""Follow the probe and tools live: the B-scan in place, skin and masses around it, in the browser and in 3D Slicer.
 
 Takes frames of both cameras and B-scans from the devices of conf/devices, or from a capture that is played back in real time;
 tracks the target, and shows where the probe and its image are, within the measured skin and the masses that were found before;
 and how far the image's plane is from each mass. A page in the browser shows it all, and an OpenIGTLink server sends it. The
 latency from the exposure to the published pose is measured and shown. A device that is lost is opened again every second. Goes on
-until it is interrupted, or for some seconds. Writes nothing.
+until it is interrupted, or for some seconds. Writes nothing, but for a table with record=FILE.
+
+Further bodies of the rig are followed, too. A tool's tip is measured against masses, a planned path and the B-scan's plane. With
+a body called patient all is told as it stood at reference=FILE: skin, masses and plan are of that world.
 
     sonotwin navigate capture=session/capture skin=result/surface/surface.ply masses=result/masses/scan lag_s=0.05
     sonotwin navigate devices=basler calibration=optics.yaml probe=probe.yaml skin=surface.ply masses=masses lag_s=0.05
+    sonotwin navigate capture=session/capture rig=three_bodies tips.needle=tip.yaml reference=reference.csv masses=masses
 """
 
 from collections.abc import Mapping
@@ -16,34 +20,43 @@ from pathlib import Path
 from time import monotonic, sleep
 from typing import Annotated, Any, Literal, NamedTuple, cast
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, probe_files
+from recon.capture import calibration_files, manifest, probe_files, sweep_tables, tip_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
 from recon.devices.device_clocks import ClockFollower, follow
 from recon.devices.interfaces import Camera, DeviceError, Size
 from recon.devices.openigtlink.igtl_server import PORT, Server
 from recon.devices.playback import PlayedCamera, PlayedScanner
-from recon.errors import InputError
+from recon.errors import InputError, did_you_mean
+from recon.model.part import Vector
 from recon.model.probe import ProbeCalibration, Speed
-from recon.model.rig import Part, Positive
-from recon.model.tracks import LagSeconds
-from recon.navigation import mass_distances, still_scene
+from recon.model.rig import PATIENT, PROBE, Part, Positive
+from recon.model.tip import Tip
+from recon.model.tracks import LagSeconds, Track
+from recon.navigation import mass_distances, still_scene, tool_distances
 from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.feeds import Device, FollowedClock
+from recon.navigation.moving_bodies import MovingBodies
+from recon.navigation.navigation_record import RecordTable
 from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
+from recon.navigation.tool_figures import Alarms
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
-from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
+from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
+from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker
 from sonotwin.console_watch import LineConsole
 from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
 
 LOOK_S = 0.2  # between two looks whether all goes on
+SEARCH_S = 0.2  # between two searches for bodies that are lost, which take as long as several pairs
+PLAN_MM = 1.0, 1000.0  # least and most from a planned path's entry to its aim: others are in another unit
 
 
 class View(Part):
@@ -66,7 +79,7 @@ class Igtl(Part):
     """of TCP: the one registered for OpenIGTLink; give another beside a PlusServer; 0 takes any that is free"""
 
 
-class Config(MeasuredTargetFields):
+class Config(BodyFields):
     """Fields of `sonotwin navigate`."""
 
     devices: Annotated[LiveDevices | None, Choice(None)] = None
@@ -97,6 +110,17 @@ class Config(MeasuredTargetFields):
     """leave out the plane that the skin stands on; false shows all of the surface"""
     masses: Path | None = None
     """folder of `sonotwin segment`"""
+    reference: Path | None = None
+    """file: the pose of the body `patient` at which skin and masses were measured, reference.csv of `sonotwin track`; null: its
+    first one, which is said"""
+    tips: dict[str, Path] = Field(default_factory=dict)
+    """files of `sonotwin calibrate-tip` by names of rig.bodies: tips.needle=FILE"""
+    plan: tuple[Vector, Vector] | None = None
+    """mm in the world, a path's entry and aim: [[x,y,z],[x,y,z]]"""
+    alarm: Alarms = Alarms()
+    """when a tool's row on the page is an alarm"""
+    record: Path | None = None
+    """table, a new .csv: each moment's poses of all bodies, and tools' figures"""
     view: View = View()
     """the page in the browser"""
     igtl: Igtl = Igtl()
@@ -108,6 +132,14 @@ class Config(MeasuredTargetFields):
     @classmethod
     def _no_stand_ins(cls, given: Any) -> Any:
         return of_a_laboratory(given, "a recorded or rendered sweep is played back by capture=FOLDER")
+
+    @field_validator("plan")
+    @classmethod
+    def _two_points(cls, given: tuple[Vector, Vector] | None) -> tuple[Vector, Vector] | None:
+        least, most = PLAN_MM
+        if given is not None and not least <= (apart := np.linalg.norm(np.subtract(*given))) <= most:
+            raise ValueError(f"expected an entry and an aim {least:g} to {most:g} mm apart, found {apart:.3g} mm")
+        return given
 
     @model_validator(mode="after")
     def _one_source(self) -> "Config":
@@ -138,14 +170,23 @@ def run(config: Config) -> int:
     console = LineConsole()
     sources = sources_of(config)
     probe = probe_of(config)
+    tools, reference = tools_of(config), reference_of(config)
+    plan = None if config.plan is None else np.array(config.plan)
     tracker = tracker_of(config, sources.sizes, sources.bits)
+    target = tracker.trackers[PROBE].target if isinstance(tracker, BodyTracker) else tracker.target
     with console.status("reading skin and masses"):
-        scene = still_scene.read_scene(config.skin, config.masses, tracker.target, probe, sources.width, config.part_table)
+        scene = still_scene.read_scene(config.skin, config.masses, target, probe, sources.width, config.part_table, tools, plan)
     with console.status("getting ready to track"):
         warm_up(tracker)
-    bodies = mass_distances.bodies_of(scene.masses)
-    publishers = publishers_of(config, scene, console)
-    navigator = Navigator((sources.cam1, sources.cam2), sources.scanner, tracker, probe, config.lag_s, bodies, publishers)
+    masses = mass_distances.bodies_of(scene.masses)
+    measured = masses if any(tools.values()) else {}
+    surfaces = {name: tool_distances.surface_of(mass.vertices, mass.faces) for name, mass in measured.items()}
+    moving = MovingBodies(tools, surfaces, plan, reference)
+    publishers, recorders = publishers_of(config, scene, console)
+    cameras = sources.cam1, sources.cam2
+    navigator = Navigator(
+        cameras, sources.scanner, tracker, probe, config.lag_s, masses, publishers, moving=moving, recorders=recorders
+    )
     try:
         navigator.start()
         until = monotonic() + (config.seconds or float("inf"))
@@ -157,8 +198,8 @@ def run(config: Config) -> int:
         tell(navigator, console)
 
 
-def publishers_of(config: Config, scene: StillScene, console: Console) -> list[Publisher]:
-    """Open the page and the OpenIGTLink server; if a port is taken, none of them stays open."""
+def publishers_of(config: Config, scene: StillScene, console: Console) -> tuple[list[Publisher], list[Publisher]]:
+    """Open the page and the OpenIGTLink server, and begin the record; if one is refused, none of them stays open."""
     with ExitStack() as stack:
         slicer: list[Publisher] = []
         told: list[str] = []
@@ -166,12 +207,45 @@ def publishers_of(config: Config, scene: StillScene, console: Console) -> list[P
             server = opened_server(config.igtl)
             stack.callback(server.close)
             told.append(f"OpenIGTLink {config.igtl.host}:{server.port}")
-            slicer = [SlicerPublisher(scene, IgtlSender(server))]
-        view = BrowserView(scene, config.view.port, config.view.host)  # last, as it would print at the end of a refused run
+            slicer = [SlicerPublisher(scene, IgtlSender(server), config.alarm)]
+        view = BrowserView(scene, config.view.port, config.view.host, config.alarm)
+        stack.callback(view.close)
+        record: list[Publisher] = []  # last, as it leaves a file
+        if config.record is not None:
+            record = [RecordTable(config.record, list(config.rig.bodies), list(scene.masses))]
+            told.append(f"record      {config.record}")
         for line in (f"view        {view.address}", *told):
             console.print(line, markup=False)
         stack.pop_all()  # they are the navigator's now
-        return [view, *slicer]
+        return [view, *slicer], record
+
+
+def tools_of(config: Config) -> dict[str, Tip | None]:
+    """Tips of the rig's bodies besides probe and patient by name; None of one that isn't calibrated.
+
+    Raises
+    ------
+    InputError
+        As of `recon.capture.tip_files.read`, or if a tip is of no such body.
+    """
+    names = [name for name in config.rig.bodies if name != PATIENT]
+    for name, path in config.tips.items():
+        if name not in names:
+            expected = f"a tool of rig.bodies, {', '.join(names)}" if names else "none, as rig.bodies names no tool"
+            raise InputError(f"tips.{name}: expected {expected}, found {path}{did_you_mean(name, names)}")
+    return {name: tip_files.read(config.tips[name]) if name in config.tips else None for name in names}
+
+
+def reference_of(config: Config) -> Track | None:
+    """The patient's pose at which skin and masses were measured; InputError if there is no such body, or no pose in the file."""
+    if config.reference is None:
+        return None
+    if PATIENT not in config.rig.bodies:
+        raise InputError(f"reference: expected none without the body {PATIENT} in rig.bodies, found {config.reference}")
+    given = sweep_tables.read_track(config.reference)
+    if not given.found.any():
+        raise InputError(f"{config.reference}: expected a pose of the {PATIENT}, found none")
+    return given
 
 
 def opened_server(chosen: Igtl) -> Server:
@@ -204,11 +278,13 @@ def probe_of(config: Config) -> ProbeCalibration:
     return sound_in_water.for_tissue(probe_files.read(path), config.tissue_m_s)
 
 
-def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker:
+def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker | BodyTracker:
     """The tracker, by the calibration of cameras of some sizes: from its file, else from the capture."""
     known = calibration_files.read_for(given_or_held(config, "calibration", "the cameras' calibration"), sizes)
-    cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
-    return make_tracker(config, target_of(config), cameras, known.uncertainty, bits if bits > 8 else None)
+    cameras, deep = (known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]), bits if bits > 8 else None
+    if config.rig.bodies:
+        return make_body_tracker(config, cameras, known.uncertainty, deep, SEARCH_S)
+    return make_tracker(config, targets_of(config)[PROBE], cameras, known.uncertainty, deep)
 
 
 def given_or_held(config: Config, field: Literal["calibration", "probe"], what: str) -> Path:

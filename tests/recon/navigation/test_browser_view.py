@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.model.tip import Tip
 from recon.navigation import browser_view
 from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.mass_distances import MassDistance, bodies_of, distances
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.publishing import Latency, Moment, StillScene
+from recon.navigation.publishing import BodyAt, Latency, Moment, StillScene
+from recon.navigation.tool_distances import AtPlane, Crossing, TipFigures
 from tests.recon.navigation import headless_browser
 
 pytest.importorskip("viser")
@@ -24,6 +26,14 @@ BALL = trimesh.creation.icosphere(3, 60.0).apply_translation([0, 0, 700])
 POSE = rigid.transform(np.eye(3), [0, 0, 640])
 SHAPE, MM_PER_PX = (120, 80), 0.5
 CANVAS = "[...document.querySelectorAll('canvas')].map(each => each.getBoundingClientRect()).sort((a, b) => b.width - a.width)[0]"
+
+
+TIP = Tip(np.array([0.0, 0, -150]), np.eye(6), np.array([0.0, 0, -1]))
+
+
+def needle_at(plane, pose=POSE):
+    """A needle whose shaft lies beside a B-scan as given."""
+    return BodyAt("needle", "predicted", pose, pose, TipFigures(np.zeros(3), np.eye(3), TIP.axis, {}, None, plane))
 
 
 def free_port():
@@ -54,6 +64,42 @@ def test_a_mass_is_outlined_where_the_plane_cuts_it():
     away = np.hypot(u - 30, v - 70)
     assert len(u) > 100 and (np.abs(away - 20) < 2.5).all()
     assert (scan.image == 90).all(), "drawn into a copy"
+
+
+@pytest.mark.parametrize("ahead", [12.0, -12.0])
+def test_a_tool_is_drawn_where_its_shaft_meets_the_image(ahead):
+    """The part in the slice as a line, the crossing as a cross ahead of the tip, as a ring behind; into a copy."""
+    picture = np.full((*SHAPE, 3), 90, np.uint8)
+    seen = np.array([[10.0, 100], [10, 20]])
+    drawn = browser_view.with_tools(picture, (needle_at(AtPlane(1.0, 0.1, Crossing(np.array([40.0, 60]), ahead, True), seen)),))
+    changed = (drawn != picture).any(axis=-1)
+    assert changed[25:95, 10].all() and not changed[:15].any() and not changed[:, :7].any()
+    assert changed[60, 40] == (ahead > 0) and changed[60, 40 + browser_view.MARK_PX] == (ahead < 0)
+    assert (picture == 90).all()
+
+
+def test_a_crossing_beside_the_image_is_not_drawn():
+    picture = np.full((*SHAPE, 3), 90, np.uint8)
+    beside = needle_at(AtPlane(1.0, 0.1, Crossing(np.array([4e9, -60]), 12.0, False), None))
+    lost = BodyAt("needle", "not found: no reason")
+    assert (browser_view.with_tools(picture, (beside, lost)) == picture).all()
+
+
+def test_a_tool_is_shown_in_space_as_long_as_it_is_seen():
+    plan = np.array([[0.0, 0, 600], [10, 0, 650]])
+    view = BrowserView(StillScene(np.eye(4), tools={"needle": TIP}, shapes={"needle": BALL}, plan=plan), 0)
+    try:
+        turned = rigid.from_rotation_vector([0, 0, 1], [10, 20, 640])
+        handle = view._tools["needle"]
+        assert not handle.visible
+        view.publish(Moment(1, 0, None, "target not found", bodies=(BodyAt("needle", "predicted", turned),)))
+        assert handle.visible
+        np.testing.assert_allclose(handle.position, np.array([10, 20, 640]) * browser_view.M)
+        np.testing.assert_allclose(handle.wxyz, browser_view.turn_of(turned))
+        view.publish(Moment(2, 0, None, "no frames of both cameras"))
+        assert not handle.visible
+    finally:
+        view.close()
 
 
 @pytest.mark.parametrize("middle", [(40, 60), (2, 60), (40, 8), (40, 112), (78, 118)])

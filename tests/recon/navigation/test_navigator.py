@@ -10,11 +10,14 @@ import trimesh
 from recon.devices.interfaces import DeviceError
 from recon.errors import InputError
 from recon.geometry import rigid
+from recon.model.tip import Tip
 from recon.navigation.feeds import Device
 from recon.navigation.mass_distances import bodies_of
+from recon.navigation.moving_bodies import MovingBodies
 from recon.navigation.navigator import Navigator
 from recon.tracking.pose_fit import lost
 from tests.recon import probe_motions
+from tests.recon.navigation.bodies_seen import NEEDLE, PROBE, three, unseen
 from tests.recon.navigation.live_stand_ins import Kept, Ticking, until
 
 PERIOD_S = 0.02
@@ -60,13 +63,14 @@ def navigate(rig):
     """Start a navigator of devices that share a clock; all are stopped in the end."""
     running, start = [], monotonic_ns()
 
-    def begin(publishers, tracker=None, opener=lambda name: None, masses=None):
+    def begin(publishers, tracker=None, opener=lambda name: None, masses=None, **others):
         def device(name):
             return Device(name, lambda: opener(name) or Ticking(start, PERIOD_S), own_clock)
 
         cam1, cam2, us = map(device, ("cam1", "cam2", "us"))
         probe = probe_motions.true_probe(rig)
-        running.append(Navigator((cam1, cam2), us, tracker or Steady(), probe, 0.01, bodies_of(masses or {}), publishers, 0.05))
+        masses = bodies_of(masses or {})
+        running.append(Navigator((cam1, cam2), us, tracker or Steady(), probe, 0.01, masses, publishers, 0.05, **others))
         running[-1].start()
         return running[-1]
 
@@ -207,3 +211,42 @@ def test_a_publisher_that_fails_ends_it_all(navigate, monkeypatch):
     monkeypatch.setattr("threading.excepthook", lambda fault: None)
     navigator = navigate([Failing()])
     until(lambda: not navigator.running)
+
+
+class Three:
+    """A tracker of three bodies at rest, some of which may be hidden."""
+
+    hidden: tuple[str, ...] = ()
+
+    def step(self, left, right, time_s):
+        return three(**{name: unseen() for name in self.hidden})
+
+
+def test_tools_come_with_their_tips_beside_the_b_scan(navigate):
+    tip = Tip(np.array([0.0, 5, -150]), np.eye(6) * 1e-4, np.array([0.0, 0, -1]))
+    kept, tracker = Kept(), Three()
+    navigate([kept], tracker, moving=MovingBodies({"needle": tip}))
+    until(lambda: any(moment.scan is not None for moment in kept.moments))
+    moment = kept.moments[-1]
+    np.testing.assert_allclose(moment.world_from_target, PROBE, atol=1e-9)
+    assert [body.name for body in moment.bodies] == ["needle", "patient"]
+    np.testing.assert_allclose(moment.bodies[0].figures.tip, rigid.apply(NEEDLE, tip.tip_mm), atol=1e-9)
+    assert next(one for one in kept.moments if one.scan is not None).bodies[0].figures.plane is not None
+    tracker.hidden = ("probe",)
+    until(lambda: kept.moments[-1].world_from_target is None)
+    assert kept.moments[-1].places_any and kept.moments[-1].bodies[0].figures is not None, "a tool needs no probe"
+    tracker.hidden = ("patient",)
+    until(lambda: not kept.moments[-1].places_any and kept.moments[-1].scan is None)
+    assert all(body.world_from_body is None and body.figures is None for body in kept.moments[-1].bodies)
+    assert kept.moments[-1].state.startswith("patient not found: camera 1: 2 of 3 circles")
+
+
+def test_a_record_gets_every_moment_however_slow_it_is(navigate):
+    """Half as fast as moments come, and yet it misses none; the page beside it is not held up."""
+    kept, record = Kept(), Kept("record", 2 * PERIOD_S)
+    navigator = navigate([kept], recorders=[record])
+    until(lambda: len(record.moments) >= 10)
+    navigator.stop()
+    numbers = [moment.number for moment in record.moments]
+    assert numbers == list(range(1, numbers[-1] + 1)) and numbers[-1] >= kept.moments[-1].number
+    assert record.closed and record.moments[-1].frame_ns is not None

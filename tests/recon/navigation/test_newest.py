@@ -3,7 +3,7 @@
 from threading import Thread
 from time import monotonic, sleep
 
-from recon.navigation.newest import Newest
+from recon.navigation.newest import Every, Newest
 from tests.patience import PATIENCE_S
 
 
@@ -31,3 +31,15 @@ def test_an_end_wakes_who_waits():
     start = monotonic()
     assert place.take(PATIENCE_S) is None
     assert monotonic() - start < PATIENCE_S
+
+
+def test_a_reader_that_must_miss_none_takes_all_in_their_order():
+    """What came before the end is taken after it, too; of more than fit in the oldest go, and are counted."""
+    place = Every(most=5)
+    for k in range(4):
+        place.put(k)
+    place.close()
+    assert [place.take(0.0) for _ in range(5)] == [0, 1, 2, 3, None] and place.replaced == 0
+    for k in range(7):
+        place.put(k)
+    assert place.take(0.0) == 2 and place.replaced == 2

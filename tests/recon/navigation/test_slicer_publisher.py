@@ -1,15 +1,18 @@
 """What 3D Slicer gets lies in its frame where the files that we write for it lie."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
 
 from recon.freehand import sequences
 from recon.geometry import rigid
+from recon.model.tip import Tip
 from recon.navigation import slicer_publisher
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.placed_scans import PlacedScan
-from recon.navigation.publishing import Moment, StillScene
+from recon.navigation.publishing import BodyAt, Moment, StillScene
 from recon.navigation.slicer_publisher import SlicerPublisher
 from tests.recon import probe_motions
 
@@ -109,3 +112,55 @@ def test_a_lost_target_sends_no_pose_but_says_why(scene):
     SlicerPublisher(scene, sent).publish(Moment(1, 5, None, "target not found", troubles=("cam2: unplugged",)))
     assert not sent.of(slicer_publisher.TARGET) and not sent.of(slicer_publisher.SCAN)
     assert sent.of(slicer_publisher.STATUS) == ["target not found; cam2: unplugged"]
+
+
+TIP = Tip(np.array([4.0, 5, -150]), np.eye(6), np.array([0.6, 0.0, -0.8]))
+NEEDLE = rigid.from_rotation_vector([3.0, -0.2, 0.5], [-60, 20, 640])
+
+
+def with_needle(scene, tip=TIP):
+    return dataclasses.replace(scene, tools={"needle": tip})
+
+
+def test_bodies_and_tips_are_sent_by_the_names_of_plus(scene):
+    """`NeedleTipToRAS`: the origin at the tip, z along the shaft, x as near to the body's as can be."""
+    sent = Sent()
+    bodies = (BodyAt("needle", "predicted", NEEDLE), BodyAt("patient", "predicted", POSE))
+    SlicerPublisher(with_needle(scene), sent).publish(Moment(1, 5, None, "target not found", bodies=bodies))
+    assert {name for kind, name, *_ in sent.messages if kind == "transform"} == {"NeedleToRAS", "NeedleTipToRAS", "PatientToRAS"}
+    (ras_from_body,), (ras_from_tip,) = sent.of("NeedleToRAS"), sent.of("NeedleTipToRAS")
+    flip = np.diag([-1.0, -1, 1, 1])
+    np.testing.assert_allclose(ras_from_body, flip @ NEEDLE, atol=1e-12)
+    np.testing.assert_allclose(ras_from_tip[:3, 3], rigid.apply(flip @ NEEDLE, TIP.tip_mm), atol=1e-9)
+    np.testing.assert_allclose(ras_from_tip[:3, 2], rigid.rotate(flip @ NEEDLE, TIP.axis), atol=1e-12)
+    assert rigid.fault(ras_from_tip) is None
+    x = rigid.rotate(np.linalg.inv(flip @ NEEDLE), ras_from_tip[:3, 0])
+    np.testing.assert_allclose(x, [0.8, 0, 0.6], atol=1e-12)  # in the plane of shaft and x, across the shaft
+    assert sent.of("Tools") == ["needle: seen, no figures"]
+
+
+@pytest.mark.parametrize("axis", [[1.0, 0, 0], [-1.0, 0, 0], None])
+def test_a_tips_frame_is_one_of_any_shaft(axis):
+    tip = Tip(TIP.tip_mm, np.eye(6), None if axis is None else np.array(axis))
+    found = slicer_publisher.body_from_tip(tip)
+    assert rigid.fault(found, 1e-9) is None
+    np.testing.assert_allclose(found[:3, 2], [0, 0, 1] if axis is None else axis, atol=1e-12)
+
+
+def test_a_tool_that_is_not_seen_sends_no_pose_but_says_so(scene):
+    sent = Sent()
+    lost = BodyAt("needle", "not found: camera 1: 2 of 3 circles")
+    SlicerPublisher(with_needle(scene), sent).publish(Moment(1, 5, None, "target not found", bodies=(lost,)))
+    assert not sent.of("NeedleToRAS") and not sent.of("NeedleTipToRAS")
+    assert sent.of("Tools") == ["needle: not seen: camera 1: 2 of 3 circles"]
+
+
+def test_names_of_bodies_stay_distinct_and_fit_in_a_message(scene):
+    sent = Sent()
+    names = ["target", "biopsy_needle_left", "biopsy_needle_right"]
+    bodies = tuple(BodyAt(name, "predicted", NEEDLE) for name in names)
+    tools = dataclasses.replace(scene, tools=dict.fromkeys(names, TIP))
+    SlicerPublisher(tools, sent).publish(Moment(1, 5, POSE, "target predicted", bodies=bodies))
+    found = [name for kind, name, *_ in sent.messages if kind == "transform"]
+    assert len(set(found)) == len(found) == 2 + 2 * len(names) and max(map(len, found)) <= 20
+    np.testing.assert_allclose(sent.of("TargetToRAS")[0], np.diag([-1.0, -1, 1, 1]) @ POSE)
