@@ -17,7 +17,6 @@ from recon.errors import InputError
 from recon.geometry.pose_hypotheses import POINTS
 from recon.model import circle_layout
 from recon.model.rig import parted_mm
-from recon.threads import mapped
 from recon.tracking import circle_detector, constellations, covered_circle
 from recon.tracking.circle_detector import Detections
 from recon.tracking.constellations import Points
@@ -58,7 +57,7 @@ class BodyTracker:
             frames = paired(first.cameras, (left, right), first.bits)
         except InputError as error:
             return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
-        results = dict(zip(self.trackers, mapped(lambda one: one.follow(frames, moment), self.trackers.values()), strict=True))
+        results = {name: tracker.follow(frames, moment) for name, tracker in self.trackers.items()}
         found = {name: result for name, result in results.items() if result is not None and result.found}
         if first.networks is not None and self._is_due(found, moment, time_s is not None):
             results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
