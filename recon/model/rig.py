@@ -20,6 +20,7 @@ from recon.model.part import Finite, Fraction, Kinds, NotNegative, Part, Positiv
 MOST_CIRCLES = 8  # of a target, by the time that a search takes and the candidates that it has: half a second a window
 LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its circles can be told apart
 LEAST_PARTED_MM = 2.0  # by which distances of three circles of two bodies must differ, that one isn't taken for the other
+PARTED_TOLERANCES = 10.0  # of a circle's place, by which they must differ, too
 PARTED_SIZES = 0.2  # of a diameter, by which circles of two bodies differ that are never taken for each other
 PROBE = "probe"  # name of the body that carries `Rig.target`
 PATIENT = "patient"  # name of the body in whose frame all is told, where a rig has it
@@ -261,7 +262,9 @@ class Rig(Part):
 
     def __hash__(self) -> int:
         """Of all parts, as frozen models have it; a mapping has none of its own."""
-        return hash((*(getattr(self, name) for name in type(self).model_fields if name != "bodies"), *self.bodies.items()))
+        return hash(
+            (*(getattr(self, name) for name in type(self).model_fields if name != "bodies"), frozenset(self.bodies.items()))
+        )
 
     @property
     def targets(self) -> dict[str, Target]:
@@ -273,11 +276,14 @@ class Rig(Part):
         if PROBE in self.bodies:
             raise ValueError(f"bodies: expected names besides {PROBE}, which carries target, found {PROBE}")
         for (name, one), (rival, other) in combinations(self.targets.items(), 2):
-            parted = parted_mm(one, other)
-            if parted < LEAST_PARTED_MM and not (one.unusual or other.unusual):
+            parted, least = (
+                parted_mm(one, other),
+                max(LEAST_PARTED_MM, PARTED_TOLERANCES * max(one.tolerance_mm, other.tolerance_mm)),
+            )
+            if parted < least and not (one.unusual or other.unusual):
                 own = f"bodies.{rival}"
                 raise ValueError(
-                    f"{own}: expected three circles whose distances differ by {LEAST_PARTED_MM:g} mm or more from those of the "
+                    f"{own}: expected three circles whose distances differ by {least:g} mm or more from those of the "
                     f"{name}'s target, or circles {100 * PARTED_SIZES:.0f} % larger or smaller, found {parted:.1f} mm: either "
                     f"may be taken for the other. `sonotwin print part=target family={len(self.targets)}` proposes targets that "
                     f"can't; unusual=true takes them as they are"

@@ -49,7 +49,7 @@ def _others(first: Target) -> list[Target]:
             continue
         around = np.array([max(c1, aside) - min(0.0, aside), c2]) + first.outer_diameter_mm + white
         lengths = {"c1_mm": float(c1), "c2_mm": float(c2), "c2_aside_mm": aside, "board_mm": tuple(np.ceil(around).tolist())}
-        shared = {name: getattr(first, name) for name in ("outer_diameter_mm", "inner_diameter_mm", "tolerance_mm")}
+        shared = {name: getattr(first, name) for name in ("outer_diameter_mm", "inner_diameter_mm", "tolerance_mm", "unusual")}
         try:
             found.append(usual.model_validate(shared | lengths))
         except ValueError:  # circles that can't be told from each other

@@ -77,12 +77,14 @@ def relative(track: Track, reference: Track, at_first: Track) -> Track:
     """A track in the world as it was when a reference body stood at its first pose: how that moved since is undone.
 
     `world_from_body` becomes `world_from_first_reference @ reference_from_world @ world_from_body`. What errs alike in all poses
-    of the reference errs so in its first one, too, and mostly cancels; the first one's own noise is alike in all that follows.
+    of the reference errs so in a first one of the same cameras and target, too, and mostly cancels; the first one's own noise is
+    alike in all that follows.
 
     Parameters
     ----------
     track, reference : of the same n moments; where the reference wasn't found there is no pose
-    at_first : the reference's first pose, the first one of this track that was found
+    at_first : the reference's first pose, the first one of this track that was found; without a shared part, if it is of other
+        cameras or another measured target
 
     Raises
     ------
@@ -112,7 +114,8 @@ def relative(track: Track, reference: Track, at_first: Track) -> Track:
     if track.covariance is not None and reference.covariance is not None:
         own = spread(by_body, track.covariance) + spread(by_reference, reference.covariance)
     if own is not None and track.shared is not None and reference.shared is not None:
-        shared = spread(by_body, track.shared) + spread(by_reference + by_first, reference.shared)
+        apart = at_first.covariance is not None and at_first.shared is None
+        shared = spread(by_body, track.shared) + spread(by_reference if apart else by_reference + by_first, reference.shared)
         if at_first.covariance is not None:
             shared = shared + spread(by_first, at_first.covariance[first])
     return Track(track.times, poses, own, shared)

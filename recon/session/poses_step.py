@@ -1,6 +1,7 @@
 """Poses of all bodies from the frames of two cameras: the settings of the step, the step, and the files of its result."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from recon.capture.manifest import CAMERAS
 from recon.capture.stereo_frames import Film, Pair
 from recon.errors import InputError
 from recon.files import atomic, metrics
-from recon.files.metrics import Metrics, shown
+from recon.files.metrics import Metrics
 from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import PATIENT, PROBE, Target
@@ -23,7 +24,7 @@ from recon.session.watch import SILENT, Watch
 from recon.tracking import results, track_figures
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.results import BODIES, Step
-from recon.tracking.tracker import Tracker, Tracking
+from recon.tracking.tracker import Tracker, Tracking, is_beside
 
 BY = "track"  # who writes
 REFERENCE = f"{BODIES}/{PATIENT}/reference.csv"
@@ -56,29 +57,28 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, a network is missing, or `out` can't be written to.
+        If the capture is incomplete or damaged, a network is missing, the patient's reference can't be had, or `out` can't be
+        written to.
     """
     given = (settings.calibration, settings.target, *settings.measured.values(), settings.networks, settings.reference)
-    sources = (settings.capture, *given)
-    atomic.check_folder(out, BY, inputs=sources)
+    atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     film = stereo_frames.read_film(settings.capture, settings.calibration, settings.sweep)
     targets = targets_of(settings)
     tracker = _tracker(settings, film)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     watch.say(f"read        {len(film.times)} pairs of frames, {sizes}{rate}")
+    beside_patient = is_of_patient(settings)
+    reference = find_reference(settings, tracker, film) if beside_patient and isinstance(tracker, BodyTracker) else None
     with atomic.new_folder(out, BY) as folder:
         start = perf_counter()
-        of_patient = _of_patient(settings)
-        at_rest = first_reference(settings, tracker, film) if of_patient and isinstance(tracker, BodyTracker) else None
         steps = track(film, tracker, folder if settings.overlays else None, watch)
-        figures = report(steps, targets, watch)
-        reference = at_rest or (_first_seen(steps) if of_patient else None)
-        poses = results.track_of(steps[PROBE])
+        reference = reference or (first_seen(steps[PATIENT]) if beside_patient else None)
+        moved = None if reference is None else describe_motion(steps[PATIENT], reference, watch)
         if reference is not None:
-            poses = tracks.relative(poses, results.track_of(steps[PATIENT]), reference.pose)
-            figures |= _moved(steps[PATIENT], reference, poses, watch)
-        results.write_poses(folder, film, steps[PROBE], poses)
+            steps |= beside(steps, reference)
+        figures = report(steps, targets, watch) | (moved or {})
+        results.write_poses(folder, film, steps[PROBE])
         for name in steps.keys() - {PROBE}:
             (folder / BODIES / name).mkdir(parents=True)
             results.write_poses(folder / BODIES / name, film, steps[name])
@@ -139,65 +139,110 @@ def follow(tracker: Tracker, times: NDArray[np.int64], pairs: Iterable[Pair]) ->
         yield pair, tracker.step(*pair, time * 1e-9)
 
 
-def first_reference(settings: Settings, tracker: BodyTracker, film: Film) -> Reference | None:
-    """Where the patient stood when the skin was measured: as given, or in the fringe images of both cameras; None without either.
+def is_of_patient(settings: Settings) -> bool:
+    """Whether poses are told beside the patient: where the rig has one, but for sweeps over wires or a flat bottom, which stand
+    elsewhere at rest.
 
     Raises
     ------
     InputError
-        If there is a reference but no body of that name, or the fringe images don't show it.
+        If a reference is given and they aren't.
     """
-    if PATIENT not in tracker.trackers:
-        if settings.reference is not None:
-            raise InputError(f"reference: expected none without the body {PATIENT} in rig.bodies, found {settings.reference}")
-        return None
+    _, part = manifest.read_manifest(settings.capture).sweep_of(settings.capture / manifest.MANIFEST, "frames", settings.sweep)
+    elsewhere = part.purpose not in ("volume", None)
+    if settings.reference is not None and PATIENT not in settings.rig.bodies:
+        raise InputError(f"reference: expected none without the body {PATIENT} in rig.bodies, found {settings.reference}")
+    if settings.reference is not None and elsewhere:
+        raise InputError(f"reference: expected none for a sweep of purpose {part.purpose}, found {settings.reference}")
+    return PATIENT in settings.rig.bodies and not elsewhere
+
+
+def find_reference(settings: Settings, tracker: BodyTracker, film: Film) -> Reference | None:
+    """Where the patient stood when the skin was measured: as given, or in the fringe images of both cameras; None of a capture
+    without any.
+
+    Raises
+    ------
+    InputError
+        If the given file has no pose, or the fringe images don't show the patient to both cameras, or show two.
+    """
     if settings.reference is not None:
-        given = sweep_tables.read_track(settings.reference)
-        if not given.found.any():
-            raise InputError(f"{settings.reference}: expected a pose of the {PATIENT}, found none")
-        return Reference(given, str(settings.reference))
+        return read_reference(settings.reference)
     held = manifest.read_manifest(settings.capture).surface
-    if held is None or not set(CAMERAS) <= held.images.keys():
+    if held is None:
         return None
-    means = [mean_image(settings.capture, camera, settings.calibration) for camera in CAMERAS]
-    found = tracker.trackers[PATIENT].step(*means)
+    place = f"{settings.capture}: surface"
+    way = "give reference=FILE, or a rig without that body"
+    if lacking := [name for name in CAMERAS if name not in held.images]:
+        raise InputError(
+            f"{place}: expected fringe images of both cameras, by which the {PATIENT} stands, found none of {lacking[0]}; {way}"
+        )
+    found = tracker.step(*(mean_image(settings.capture, camera, settings.calibration) for camera in CAMERAS))[PATIENT]
     tracker.forget()
     if not found.found:
         expected = f"expected the target of the {PATIENT} in the fringe images of both cameras, found none"
-        way = "give reference=FILE, or a rig without that body"
-        raise InputError(f"{settings.capture}: surface: {expected}: {found.pose.reason}; {way}")
+        raise InputError(f"{place}: {expected}: {found.pose.reason}; {way}")
+    if is_beside(found.apart_mm):
+        raise InputError(
+            f"{place}: expected one target of the {PATIENT}, found two, {found.apart_mm:.0f} mm apart; cover one, or {way}"
+        )
     return Reference(results.track_of([results.kept(found, int(film.times[0]))]), "the fringe images")
 
 
+def read_reference(path: Path) -> Reference:
+    """A reference of an earlier run, whose cameras and target may have been known otherwise: all of its error is its own.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or damaged, or has no pose.
+    """
+    given = sweep_tables.read_track(path)
+    if not given.found.any():
+        raise InputError(f"{path}: expected a pose of the {PATIENT}, found none")
+    whole = given.covariance if given.covariance is None or given.shared is None else given.covariance + given.shared
+    return Reference(Track(given.times, given.poses, whole), str(path))
+
+
 def mean_image(capture: Path, camera: str, calibration: Path | None = None) -> NDArray[np.float32]:
-    """Mean : (h, w) DN of 255 of a camera's images of the fringe sequence, in which fringes even out."""
+    """Mean : (h, w), 1 is full, of a camera's images of the fringe sequence, in which fringes even out."""
     shots = surface_part.read_surface(capture, camera, calibration)
-    return shots.images.mean(axis=0, dtype=np.float32) * np.float32(255 / (2**shots.bits - 1))
+    return shots.images.mean(axis=0, dtype=np.float32) / np.float32(2**shots.bits - 1)
 
 
-def _of_patient(settings: Settings) -> bool:
-    """Whether a sweep is of the patient: one over wires or a flat bottom is of things that stand elsewhere, at rest."""
-    _, part = manifest.read_manifest(settings.capture).sweep_of(settings.capture / manifest.MANIFEST, "frames", settings.sweep)
-    return part.purpose in ("volume", None)
-
-
-def _first_seen(steps: Mapping[str, list[Step]]) -> Reference | None:
-    """The first pose of the patient in a film; None if there is no such body, or it isn't seen."""
-    first = next((step for step in steps.get(PATIENT, ()) if step.found), None)
+def first_seen(steps: Sequence[Step]) -> Reference | None:
+    """The first pose of the patient in a film; None if it isn't seen."""
+    first = next((step for step in steps if step.found), None)
     return None if first is None else Reference(results.track_of([first]), "its first pose in this film")
 
 
-def _moved(steps: list[Step], reference: Reference, poses: Track, watch: Watch) -> Metrics:
-    """Say how far the patient moved since the reference, which is taken out of the probe's poses; returns the figures."""
+def beside(steps: Mapping[str, Sequence[Step]], reference: Reference) -> dict[str, list[Step]]:
+    """Steps of all bodies but the patient, as if that stood where it stood at the reference."""
+    patient, told = results.track_of(steps[PATIENT]), {}
+    for name in steps.keys() - {PATIENT}:
+        own = tracks.relative(results.track_of(steps[name]), patient, reference.pose)
+        assert own.covariance is not None and own.shared is not None
+        lost = np.full((6, 6), np.nan)
+        told[name] = [
+            replace(step, world_from_target=pose, covariance=covariance, shared=shared)
+            if found
+            else replace(
+                step, world_from_target=pose, covariance=lost, shared=lost, reason=step.reason or f"the {PATIENT} isn't seen"
+            )
+            for step, pose, covariance, shared, found in zip(
+                steps[name], own.poses, own.covariance, own.shared, own.found, strict=True
+            )
+        ]
+    return told
+
+
+def describe_motion(steps: Sequence[Step], reference: Reference, watch: Watch) -> Metrics:
+    """Say how far the patient moved since the reference, which is taken out of poses; returns the figures, NaN of one unseen."""
     first = reference.pose.poses[int(np.argmax(reference.pose.found))]
     moves = np.array([rigid.difference(first, step.world_from_target) for step in steps if step.found]).reshape(-1, 6)
-    turns, shifts = np.rad2deg(np.linalg.norm(moves[:, :3], axis=1)), np.linalg.norm(moves[:, 3:], axis=1)
-    figures = {
-        "patient_moved_mm": float(shifts.max(initial=0.0)),
-        "patient_turned_deg": float(turns.max(initial=0.0)),
-        "poses_by_patient": int(poses.found.sum()),
-    }
-    moved = f"{shown(figures['patient_moved_mm'], '.2f', ' mm')} and {shown(figures['patient_turned_deg'], '.2f', ' deg')}"
-    watch.say(f"patient     moved by up to {moved} since {reference.source}; poses are told as if it stood there")
-    watch.say(f"relative    {figures['poses_by_patient']} poses of the probe beside the patient")
+    turn, shift = (float(np.linalg.norm(part, axis=1).max(initial=-np.inf)) for part in (moves[:, :3], moves[:, 3:]))
+    seen = bool(len(moves))
+    figures: Metrics = {"patient_moved_mm": shift if seen else np.nan, "patient_turned_deg": np.rad2deg(turn) if seen else np.nan}
+    moved = f"by up to {shift:.2f} mm and {np.rad2deg(turn):.2f} deg" if seen else "unknown, as it isn't seen"
+    watch.say(f"patient     moved since {reference.source}: {moved}; all poses are told as if it stood there")
     return figures

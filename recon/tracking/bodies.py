@@ -15,20 +15,19 @@ from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.geometry.pose_hypotheses import POINTS
-from recon.model import circle_layout
-from recon.model.rig import parted_mm
 from recon.tracking import circle_detector, constellations, covered_circle
 from recon.tracking.circle_detector import Detections
 from recon.tracking.constellations import Points
-from recon.tracking.pose import DISTINCT, GROSS_MM, distances
+from recon.tracking.pose import DISTINCT, UNTOLD, same
 from recon.tracking.pose_fit import lost
 from recon.tracking.rims import Outlines, hole_of, measure_again
 from recon.tracking.tracker import NO_NETWORKS, Moment, Tracker, Tracking, paired, rank
-from recon.tracking.views import doubted
-
-Array = NDArray[np.float64]
+from recon.tracking.views import diameter, doubted
 
 CIRCLES = 40  # candidates of a window, of all bodies and of what else is round
+
+
+WAITING = "lost, and not searched for in this pair"
 
 
 class _Claim(NamedTuple):
@@ -59,12 +58,13 @@ class BodyTracker:
             return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
         results = {name: tracker.follow(frames, moment) for name, tracker in self.trackers.items()}
         found = {name: result for name, result in results.items() if result is not None and result.found}
-        if first.networks is not None and self._is_due(found, moment, time_s is not None):
-            results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
-            self._searched = moment.now
-        kept = {
-            name: tracker.keep(results[name] or tracker.unseen(NO_NETWORKS), moment) for name, tracker in self.trackers.items()
-        }
+        if first.networks is not None:
+            look = self._looked is None or not 0 <= moment.now - self._looked < moment.look
+            if look or self._search_is_due(found, moment, time_s is not None):
+                results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
+                self._searched, self._looked = moment.now, moment.now if look else self._looked
+        reason = NO_NETWORKS if first.networks is None else WAITING
+        kept = {name: tracker.keep(results[name] or tracker.unseen(reason), moment) for name, tracker in self.trackers.items()}
         seconds = {"bodies": (perf_counter() - start) / len(kept)}
         return {name: replace(result, seconds=seconds) for name, result in kept.items()}
 
@@ -74,63 +74,39 @@ class BodyTracker:
         for tracker in self.trackers.values():
             tracker.forget()
 
-    def _is_due(self, found: Mapping[str, Tracking], moment: Moment, timed: bool) -> bool:
-        """Whether to search: for what is lost, and now and then for a second body of a design."""
-        if self._looked is None or not 0 <= moment.now - self._looked < moment.look:
-            self._looked = moment.now
-            return True
+    def _search_is_due(self, found: Mapping[str, Tracking], moment: Moment, timed: bool) -> bool:
+        """Whether to search for what is lost."""
         if len(found) == len(self.trackers):
             return False
         waiting = found and timed and self._searched is not None and 0 <= moment.now - self._searched < self.search_s
         return not waiting
 
     def _searched_for(self, detections: Detections, found: Mapping[str, Tracking]) -> dict[str, Tracking]:
-        """Results of the bodies that aren't found yet, and those of the others with further bodies of their design."""
+        """Results of the bodies that aren't found yet, and those of the others with further bodies of their design.
+
+        Bodies that both views show whole come first; then those of which both show two circles, and the others are sought about
+        them; then each lost one's own tracker searches among what is left. At each stage, where two bodies fit, neither is told.
+        """
         for result in found.values():
             _take(detections, result)
         rings, points = self._rings(detections)
-        whole = self._claims(detections.frames, rings, points, POINTS)
-        settled = _settled([claim for claim in whole if claim.name not in found])
-        settled += _free([claim for claim in whole if claim.name in found], settled)
-        left = points.without(set().union(*(claim.rings for claim in settled)))
         results, others = dict(found), {name: list[Tracking]() for name in self.trackers}
-        for name, result, _ in settled:
-            if name in results:
-                others[name].append(result)
-            else:
-                results[name] = result
-                _take(detections, result)
-        for name, result, _ in _free(self._claims(detections.frames, rings, left, POINTS - 1), ()):
-            if name in results:
-                others[name].append(result)
-            elif (told := self._told(name, result, results)).found:
-                results[name] = told
-                _take(detections, told)
+        for least in (POINTS, POINTS - 1):
+            claims = self._claims(detections.frames, rings, points, least)
+            settled = _settled([claim for claim in claims if claim.name not in results])
+            settled += _free([claim for claim in claims if claim.name in results], settled)
+            points = points.without(set().union(*(claim.rings for claim in settled)))
+            for name, result, _ in settled:
+                if name in results:
+                    others[name].append(result)
+                else:
+                    results[name] = result
+                    _take(detections, result)
         for name, further in others.items():
             if name in results and results[name].found:
                 results[name] = self.trackers[name].nearest(results[name], [one for one in further if one.found])
-        for name, tracker in self.trackers.items():
-            if name not in results:
-                results[name] = self._told(name, tracker.find(detections), results)
-                _take(detections, results[name])
-        return results
-
-    def _told(self, name: str, result: Tracking, results: Mapping[str, Tracking]) -> Tracking:
-        """A body of which circles are covered, unless those in both views may be those of another one that isn't found."""
-        if not result.found or result.pose.used.all():
-            return result
-        target = self.trackers[name].target
-        both = circle_layout.circle_centres(target)[result.pose.used.all(axis=0)]
-        for rival, tracker in self.trackers.items():
-            away = rival != name and not (rival in results and results[rival].found)
-            if (
-                away
-                and np.isfinite(parted_mm(target, tracker.target))
-                and _alike(both, circle_layout.circle_centres(tracker.target))
-            ):
-                pose = lost(f"circles seen in part, that may be those of the {rival}")
-                return Tracking(pose, doubted(result.views, pose.reason))
-        return result
+        missing = {name: tracker.find(detections) for name, tracker in self.trackers.items() if name not in results}
+        return results | _told(missing)
 
     def _rings(self, detections: Detections) -> tuple[tuple[Outlines, Outlines], Points]:
         """All rings of both views, in windows in which circles are as large as usual, and the points where their rays meet."""
@@ -168,18 +144,50 @@ class BodyTracker:
 
 
 def _settled(claims: Sequence[_Claim]) -> list[_Claim]:
-    """Claims that share no rings, the surest first; where two bodies fit the same rings as well, neither is told."""
+    """Claims that share no rings, the surest first; where two bodies, or two poses of one, fit the same rings, none is told."""
     settled: list[_Claim] = []
     for claim in sorted(claims, key=lambda claim: rank(claim.result)):
         rivals = [one for one in settled if one.rings & claim.rings]
         if not rivals:
             settled.append(claim)
-        elif rivals[0].name != claim.name and _as_well(claim.result, rivals[0].result):
-            pose = lost(f"circles of the {rivals[0].name}, or of the {claim.name}: no distance tells which")
-            told = Tracking(pose, doubted(claim.result.views, pose.reason))
+        elif _as_well(claim.result, rivals[0].result):
+            if rivals[0].name != claim.name:
+                told = _untold(claim.result, f"circles of the {rivals[0].name}, or of the {claim.name}: no distance tells which")
+                settled.append(claim._replace(result=told))
+            elif not same(rivals[0].result.pose, claim.result.pose):
+                told = _untold(claim.result, UNTOLD)
+            else:
+                continue
             settled = [one._replace(result=told) if one is rivals[0] else one for one in settled]
-            settled.append(claim._replace(result=told))
     return settled
+
+
+def _told(results: Mapping[str, Tracking]) -> dict[str, Tracking]:
+    """Results of lost bodies by their own searches: of two at the same circles that which fits better, neither if both do."""
+    told: dict[str, Tracking] = {}
+    for name, result in sorted(results.items(), key=lambda item: rank(item[1]) if item[1].found else (1, np.inf)):
+        rival = next((one for one in told if result.found and _overlap(results[one], result)), None)
+        if rival is None:
+            told[name] = result
+            continue
+        told[name] = _untold(result, f"circles seen in part, of the {rival} or of the {name}")
+        if _as_well(result, results[rival]):
+            told[rival] = _untold(results[rival], f"circles seen in part, of the {rival} or of the {name}")
+    return told
+
+
+def _untold(result: Tracking, reason: str) -> Tracking:
+    """The result without its pose, for a reason."""
+    return Tracking(lost(reason), doubted(result.views, reason))
+
+
+def _overlap(one: Tracking, other: Tracking) -> bool:
+    """Whether two results are at the same circle in a view."""
+    for here, there in zip(one.views, other.views, strict=True):
+        away = np.linalg.norm(here.outlines.ellipses.centre[:, None] - there.outlines.ellipses.centre, axis=-1)
+        if one.found and other.found and np.nanmin(away, initial=np.inf) < diameter(here.outlines.ellipses) / 2:
+            return True
+    return False
 
 
 def _free(claims: Sequence[_Claim], settled: Sequence[_Claim]) -> list[_Claim]:
@@ -194,12 +202,6 @@ def _free(claims: Sequence[_Claim], settled: Sequence[_Claim]) -> list[_Claim]:
 def _as_well(one: Tracking, other: Tracking) -> bool:
     """Whether a pose fits as many circles about as well as another."""
     return other.found and one.pose.freedom >= other.pose.freedom and one.pose.misfit < other.pose.misfit + DISTINCT
-
-
-def _alike(places: Array, others: Array) -> bool:
-    """Whether each distance between places : (k, 3) mm is nearly one between others : (n, 3) mm."""
-    off = np.abs(distances(places)[:, None] - distances(others))
-    return bool((off.min(axis=1, initial=np.inf) < GROSS_MM).all())
 
 
 def _take(detections: Detections, result: Tracking) -> None:

@@ -92,7 +92,7 @@ def _radius(camera: Camera, ellipses: Ellipses, places: Array) -> Array:
 def choices(points: Points, target: Target, least: int = POINTS) -> list[NDArray[np.int64]]:
     """Ways to take points for a target's circles : (n,) numbers of points, -1 of a circle that isn't seen; the likeliest first.
 
-    Those of more circles come first, then those of distances nearer to the target's.
+    They take as many points as lie like circles, and of these the ones whose distances are nearer to the target's come first.
 
     Parameters
     ----------
@@ -106,23 +106,27 @@ def choices(points: Points, target: Target, least: int = POINTS) -> list[NDArray
     rings = points.rings[fit]
     shared = (rings[:, None] == rings).any(axis=-1)  # two circles are never one ring
 
-    def extended(chosen: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    def extended(chosen: tuple[int, ...], unseen: int) -> Iterator[tuple[int, ...]]:
         k = len(chosen)
         if k == len(model):
             yield chosen
             return
         seen = [(number, one) for number, one in enumerate(chosen) if one >= 0]
-        for new in range(len(fit)):
-            if all(not shared[new, one] and abs(far[new, one] - expected[k, number]) < GROSS_MM for number, one in seen):
-                yield from extended((*chosen, new))
-        if len(seen) + len(model) - k - 1 >= least:
-            yield from extended((*chosen, -1))
+        if len(model) - k > unseen:
+            for new in range(len(fit)):
+                if all(not shared[new, one] and abs(far[new, one] - expected[k, number]) < GROSS_MM for number, one in seen):
+                    yield from extended((*chosen, new), unseen)
+        if unseen:
+            yield from extended((*chosen, -1), unseen - 1)
 
-    def off(chosen: tuple[int, ...]) -> tuple[int, float]:
+    def off(chosen: tuple[int, ...]) -> float:
         seen = [(number, one) for number, one in enumerate(chosen) if one >= 0]
-        return -len(seen), sum((far[a, b] - expected[i, j]) ** 2 for i, a in seen for j, b in seen)
+        return sum((far[a, b] - expected[i, j]) ** 2 for i, a in seen for j, b in seen)
 
-    return [np.where(np.array(one) < 0, -1, fit[list(one)]) for one in sorted(extended(()), key=off)[:KEPT]]
+    for unseen in range(len(model) - least + 1):
+        if found := sorted(extended((), unseen), key=off)[:KEPT]:
+            return [np.where(np.array(one) < 0, -1, fit[list(one)]) for one in found]
+    return []
 
 
 def chosen_rims(rings: tuple[Outlines, Outlines], points: Points, choice: NDArray[np.int64]) -> list[Outlines]:

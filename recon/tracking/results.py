@@ -81,12 +81,9 @@ def track_of(steps: Sequence[Step]) -> Track:
     )
 
 
-def write_poses(folder: Path, film: Film, steps: Sequence[Step], track: Track | None = None) -> None:
-    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not.
-
-    track : the poses, where they aren't those in camera 1's frame
-    """
-    sweep_tables.write_track(folder / POSES, track or track_of(steps))
+def write_poses(folder: Path, film: Film, steps: Sequence[Step]) -> None:
+    """Write `poses.csv`, the table that other verbs read, and `frames.csv`: how each pose was found, or why not."""
+    sweep_tables.write_track(folder / POSES, track_of(steps))
     rows = (
         [step.time_ns, *numbers, int(step.found), step.how or "", *_numbers(step), step.reason or ""]
         for numbers, step in zip(film.frames.tolist(), steps, strict=True)

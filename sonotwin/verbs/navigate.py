@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, probe_files, sweep_tables, tip_files
+from recon.capture import calibration_files, manifest, probe_files, tip_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
 from recon.devices.device_clocks import ClockFollower, follow
@@ -48,6 +48,7 @@ from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.navigation.tool_figures import Alarms
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
+from recon.session import poses_step
 from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker
@@ -242,10 +243,7 @@ def reference_of(config: Config) -> Track | None:
         return None
     if PATIENT not in config.rig.bodies:
         raise InputError(f"reference: expected none without the body {PATIENT} in rig.bodies, found {config.reference}")
-    given = sweep_tables.read_track(config.reference)
-    if not given.found.any():
-        raise InputError(f"{config.reference}: expected a pose of the {PATIENT}, found none")
-    return given
+    return poses_step.read_reference(config.reference).pose
 
 
 def opened_server(chosen: Igtl) -> Server:
