@@ -101,8 +101,8 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             answer = self._answer()
         except Refusal as refusal:
-            self._send(refusal.status, Answer("text/plain; charset=utf-8", refusal.words.encode()))
             self.site.refused(self.client_address[0], refusal.words)
+            self._send(refusal.status, Answer("text/plain; charset=utf-8", refusal.words.encode()))
         else:
             self._send(HTTPStatus.OK, answer)
 
@@ -151,13 +151,26 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a browser asks ten times a second."""
 
 
-class _Server(ThreadingHTTPServer):
+class Listening(ThreadingHTTPServer):
+    """A server that has its place and answers nobody yet."""
+
     daemon_threads = True
 
-    def __init__(self, address: tuple[str, int], handler: type[_Handler], most_visitors: int) -> None:
-        self._places = threading.BoundedSemaphore(most_visitors)
+    def __init__(self, host: str, port: int, most_visitors: int) -> None:
+        self._places, self._host = threading.BoundedSemaphore(most_visitors), host
         self.request_queue_size = most_visitors
-        super().__init__(address, handler)
+        super().__init__((host, port), _Handler)
+
+    @contextmanager
+    def serving(self, site: Site) -> Iterator[str]:
+        """Answer by a site, and give the place back at the end; gives the address."""
+        self.RequestHandlerClass = type("Handler", (_Handler,), {"site": site, "listens": self._host})
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+        try:
+            yield f"http://{self._host}:{self.server_address[1]}/"
+        finally:
+            self.shutdown()
+            self.server_close()
 
     def process_request(self, request, client_address) -> None:
         """Answer in a thread, if there are not too many."""
@@ -181,9 +194,8 @@ class _Server(ThreadingHTTPServer):
             log.error("page: %s: %s", type(error).__name__, reason(error))
 
 
-@contextmanager
-def served(site: Site, name: str, host: str = LOOPBACK, port: int = 0, most_visitors: int = MOST_VISITORS) -> Iterator[str]:
-    """Serve a site; gives its address. A port of 0 takes any that is free.
+def listen(name: str, host: str = LOOPBACK, port: int = 0, most_visitors: int = MOST_VISITORS) -> Listening:
+    """Take a place; a port of 0 takes any that is free.
 
     Parameters
     ----------
@@ -194,15 +206,8 @@ def served(site: Site, name: str, host: str = LOOPBACK, port: int = 0, most_visi
     InputError
         If the port is taken, or the host isn't this computer's.
     """
-    handler = type("Handler", (_Handler,), {"site": site, "listens": host})
     try:
-        server = _Server((host, port), handler, most_visitors)
+        return Listening(host, port, most_visitors)
     except (OSError, OverflowError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{name}: expected {host}:{port} to be free, found: {why}; give {name}.port=0") from None
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://{host}:{server.server_address[1]}/"
-    finally:
-        server.shutdown()
-        server.server_close()

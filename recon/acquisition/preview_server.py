@@ -111,5 +111,5 @@ def served(preview: Preview, host: str = LOOPBACK, port: int = 0) -> Iterator[st
     InputError
         If the port is taken, or the host isn't this computer's.
     """
-    with page_server.served(_Site(preview), "preview", host, port) as address:
+    with page_server.listen("preview", host, port).serving(_Site(preview)) as address:
         yield address

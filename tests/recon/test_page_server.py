@@ -8,7 +8,7 @@ import pytest
 
 from recon import page_server
 from recon.errors import InputError
-from recon.page_server import Answer, Refusal, served
+from recon.page_server import Answer, Refusal, listen
 from tests.recon.navigation.live_stand_ins import until
 from tests.recon.web_visitors import answer
 
@@ -32,7 +32,7 @@ class Echo:
 def echo(monkeypatch):
     monkeypatch.setattr(page_server._Handler, "timeout", 0.3)
     site = Echo()
-    with served(site, "echo") as address:
+    with listen("echo").serving(site) as address:
         yield site, address
 
 
@@ -115,7 +115,7 @@ def test_strange_and_silent_visitors_dont_stop_it(echo):
 
 
 def test_a_taken_port_is_named():
-    with served(Echo(), "echo") as address:
+    with listen("echo").serving(Echo()) as address:
         port = urlsplit(address).port
-        with pytest.raises(InputError, match=f"echo: expected 127.0.0.1:{port} to be free"), served(Echo(), "echo", port=port):
-            pass
+        with pytest.raises(InputError, match=f"echo: expected 127.0.0.1:{port} to be free"):
+            listen("echo", port=port)

@@ -19,7 +19,7 @@ from recon.files import meshes
 from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.publishing import StillScene
 from recon.tracking import networks
-from sonotwin import config
+from sonotwin import config, live_sources
 from sonotwin.cli import main
 from sonotwin.verbs import navigate
 from tests.patience import PATIENCE_S
@@ -102,7 +102,7 @@ def test_a_camera_that_refuses_a_setting_is_closed(monkeypatch, refuses):
 
     monkeypatch.setattr(camera, refuses, refuse)
     monkeypatch.setattr(camera, "close", lambda: closed.append(True))
-    monkeypatch.setattr(navigate, "open_camera", lambda devices, name: camera)
+    monkeypatch.setattr(live_sources, "open_camera", lambda devices, name: camera)
     sources = navigate.sources_of(composed("devices=basler"))
     with pytest.raises(DeviceError, match=refuses):
         sources.cam1.open()
