@@ -105,7 +105,7 @@ def test_damage_is_named_by_its_line(files, old, new, complaint):
 
 def test_a_log_of_another_skin_is_refused(files, tmp_path):
     meshes.write_ply(tmp_path / "other.ply", skin_shapes.plane(step=2.5))
-    with pytest.raises(InputError, match="expected a log of .*other.ply, found one of another skin"):
+    with pytest.raises(InputError, match=r"expected a log of .*other\.ply, found one of another skin"):
         restore(files[0], tmp_path / "other.ply")
 
 

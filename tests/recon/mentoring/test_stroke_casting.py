@@ -1,4 +1,4 @@
-"""A stroke lies where camera 1's rays meet the skin: on planes and spheres by closed forms, wherever the skin was in the picture."""
+"""A stroke lies where camera 1's rays meet the skin: on planes and spheres by closed forms, wherever the skin was."""
 
 import numpy as np
 import pytest
