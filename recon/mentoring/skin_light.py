@@ -123,7 +123,7 @@ class SkinLight:
         age_s = (now - self._known.exposed_ns) * 1e-9
         reason = self._reason or "frames come late"
         if age_s > self.hold_s:
-            return State(False, f"dark for {age_s:.0f} s: {reason}")
+            return State(False, f"dark for {age_s:.1f} s: {reason}")
         return State(True, f"lit where the patient was {age_s:.1f} s ago: {reason}" if self._reason else "lit")
 
     def _draw(self, world_from_skin: Array) -> Image:

@@ -7,10 +7,11 @@ isn't seen the projector goes dark. Writes into `out` as it goes: log.jsonl, all
 restores it; and of a capture that is played back, without a projector, lit.png, its newest picture. Goes on until it is
 interrupted, or for some seconds.
 
-    sonotwin mentor capture=session/capture skin=result/surface/surface.ply out=mentored
+    sonotwin mentor capture=session/capture skin=result/surface/surface.ply calibration=result/optics/optics.yaml out=mentored
     sonotwin mentor devices=basler calibration=optics.yaml skin=surface.ply rig=three_bodies reference=first out=mentored
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -176,13 +177,14 @@ def run(config: Config) -> int:
 
 def watch(config: Config, light: SkinLight, sightings: Sightings, log: DrawingLog, console: LineConsole) -> None:
     """Wait for the end, and say when the light comes and goes."""
-    until, told = monotonic() + (config.seconds or float("inf")), None
+    until, told = monotonic() + (config.seconds or float("inf")), ""
     while light.alive and sightings.running and monotonic() < until:
-        state = light.state
-        if state.lit != told:
-            told = state.lit
-            console.print(f"light       {state.words}", markup=False)
-            log.noted(state.words)
+        words = light.state.words
+        kind = ":".join(re.sub(r"[\d.]+", "", words).split(":")[:2])  # not each age, nor all of a reason
+        if kind != told:
+            told = kind
+            console.print(f"light       {words}", markup=False)
+            log.noted(words)
         sleep(LOOK_S)
 
 
@@ -213,7 +215,8 @@ def calibration_of(config: Config, sizes: Mapping[str, Size]) -> Calibration:
     projector = config.devices.projector if config.devices is not None else None
     known = calibration_files.read_for(path, sizes if projector is None else {**sizes, "projector": projector.size})
     if "projector" not in known.cameras:
-        raise InputError(f"{path}: expected the projector, found {', '.join(known.cameras)}")
+        found = ", ".join(known.cameras)
+        raise InputError(f"{path}: expected the projector, too, found {found}; give calibration=FILE of the whole rig")
     return known
 
 

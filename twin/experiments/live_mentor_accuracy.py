@@ -1,8 +1,8 @@
 """Accuracy of what a mentor draws: strokes on camera 1's picture of the skin against the light that camera 1 then sees of them.
 
-The whole way: a posted stroke, cast onto the measured skin; the projector's picture of it for the place of the skin by the patient's
-target; that picture's light on the true skin, seen by camera 1; the light's middle on the true skin. The patient has moved since
-the skin was measured, and goes on moving for as long as exposure, tracking, drawing and display take.
+The whole way: a posted stroke, cast onto the measured skin; the projector's picture of it for the place of the skin by the
+patient's target; that picture's light on the true skin, seen by camera 1; the light's middle on the true skin. The patient has
+moved since the skin was measured, and goes on moving for as long as exposure, tracking, drawing and display take.
 """
 
 import json

@@ -75,10 +75,10 @@ def test_it_goes_dark_when_the_patient_is_lost_and_says_why(light):
     assert light.state.lit and light.state.words == "lit where the patient was 0.4 s ago: the patient isn't found: no circles"
     light.clock.now_ms = 501
     light.step(None)  # nothing new needs to come
-    assert light.state == (False, "dark for 1 s: the patient isn't found: no circles") and light.projector.lit is None
+    assert light.state == (False, "dark for 0.5 s: the patient isn't found: no circles") and light.projector.lit is None
     light.clock.now_ms = 9000
     light.step(desk.lost(9000))
-    assert light.projector.lit is None and light.state.words.startswith("dark for 9 s")
+    assert light.projector.lit is None and light.state.words.startswith("dark for 9.0 s")
     light.step(desk.sighting(9000))
     assert light.state.lit and (light.projector.lit == place).all()
 
@@ -87,7 +87,7 @@ def test_frames_that_stop_or_come_late_are_no_place_to_light(light):
     light.step(desk.sighting(0))
     light.clock.now_ms = 700
     light.step(None)
-    assert light.state == (False, "dark for 1 s: frames come late") and light.projector.lit is None
+    assert light.state == (False, "dark for 0.7 s: frames come late") and light.projector.lit is None
     light.step(desk.sighting(100))  # 0.6 s old when it comes
     assert not light.state.lit and light.projector.lit is None
 
