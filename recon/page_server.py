@@ -88,7 +88,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     site: Site
     listens: str  # host where the server does
-    timeout = PATIENCE_S
+    timeout: float = PATIENCE_S
 
     def setup(self) -> None:
         """Begin to wait for a request."""
@@ -158,12 +158,14 @@ class Listening(ThreadingHTTPServer):
 
     def __init__(self, host: str, port: int, most_visitors: int) -> None:
         self._places, self._host = threading.BoundedSemaphore(most_visitors), host
+        self._site: Site | None = None
         self.request_queue_size = most_visitors
         super().__init__((host, port), _Handler)
 
     @contextmanager
     def serving(self, site: Site) -> Iterator[str]:
         """Answer by a site, and give the place back at the end; gives the address."""
+        self._site = site
         self.RequestHandlerClass = type("Handler", (_Handler,), {"site": site, "listens": self._host})
         threading.Thread(target=self.serve_forever, daemon=True).start()
         try:
@@ -176,7 +178,8 @@ class Listening(ThreadingHTTPServer):
         """Answer in a thread, if there are not too many."""
         if not self._places.acquire(blocking=False):
             self.shutdown_request(request)
-            self.RequestHandlerClass.site.refused(client_address[0], "expected fewer visitors at once, found all places taken")
+            if self._site is not None:
+                self._site.refused(client_address[0], "expected fewer visitors at once, found all places taken")
             return
         super().process_request(request, client_address)
 

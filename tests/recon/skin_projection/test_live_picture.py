@@ -1,4 +1,4 @@
-"""The fast picture of a skin that moves against the slow one of the skin moved, and against widths and places known beforehand."""
+"""The fast picture of a skin that moves against the slow one of the skin moved, and against widths and places known."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def moved(curve):
 
 @pytest.mark.parametrize(("line", "gamma"), [(Line(1.0), 1.0), (Line(2.5, 0.6, (4.0, 2.0)), 2.2), (Line(0.5), 1.0)])
 def test_it_is_the_picture_of_the_skin_and_curves_moved(line, gamma):
-    """Light differs at borders of strips alone: the slow picture's are up to an eighth of a pixel wider, by parts that count whole."""
+    """Light differs at borders of strips alone: the slow picture's are up to an eighth of a pixel wider."""
     skin, projector = skin_shapes.dome(), skin_shapes.projector()
     curve = ring(skin)
     found = LivePicture(skin, projector, gamma).draw(Strips.of(curve, line), MOVED)
