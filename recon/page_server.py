@@ -88,13 +88,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     site: Site
     listens: str  # host where the server does
-    timeout: float = PATIENCE_S
+    timeout: float | None = PATIENCE_S
 
     def setup(self) -> None:
         """Begin to wait for a request."""
         super().setup()
         self.rfile.close()
-        self.rfile = io.BufferedReader(_OnTime(self.connection, monotonic() + self.timeout))
+        self.rfile = io.BufferedReader(_OnTime(self.connection, monotonic() + (self.timeout or PATIENCE_S)))
 
     def do_GET(self) -> None:
         """Answer a request."""
