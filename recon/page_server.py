@@ -88,7 +88,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     site: Site
     listens: str  # host where the server does
-    timeout: float | None = PATIENCE_S
+    timeout = PATIENCE_S
 
     def setup(self) -> None:
         """Begin to wait for a request."""

@@ -127,11 +127,6 @@ class MentorSite:
             here = sorted({who for _, who in self._clients})
         return {"picture": None if sighting is None else sighting.number, "light": self.status(), "drawings": drawn, "here": here}
 
-    @property
-    def watched(self) -> bool:
-        """Whether a mentor is there."""
-        return bool(self._clients)
-
     def _who(self, token: str) -> str:
         """The mentor of a token; each is compared, in a time that tells nothing of it."""
         found = [name for name, own in self.tokens.items() if hmac.compare_digest(own.encode(), token.encode(errors="replace"))]

@@ -4,7 +4,6 @@ A skin whose patient is followed is lit where the patient was last seen for a mo
 the projector goes dark. A skin that isn't followed is lit where it was measured.
 """
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Thread
@@ -21,7 +20,6 @@ from recon.navigation.newest import Newest
 from recon.navigation.publishing import Latencies
 from recon.skin_projection.live_picture import LivePicture, Strips
 
-log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 LOOK_S = 0.05  # between looks whether it must go dark
