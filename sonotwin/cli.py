@@ -60,6 +60,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("project", "draw masses, a planned cut and the B-scan's line for the projector, onto the skin"),
     Verb("reconstruct", "reconstruct all that a capture holds: calibrations, skin, volumes, masses"),
     Verb("navigate", "follow the probe and tools live: the B-scan in place, skin and masses around it"),
+    Verb("mentor", "light on the skin what a colleague elsewhere draws on camera 1's picture"),
     Verb("import", "read another group's data set into a capture"),
     Verb("import-sweep", "read a scanner's clip and a tracker's poses into a capture"),
     Verb("export", "write a capture in another group's layout"),

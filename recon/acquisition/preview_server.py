@@ -9,19 +9,16 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import page_server
 from recon.acquisition.pictures import Over, Picture
-from recon.errors import InputError
-from recon.own_requests import FOREIGN, LOOPBACK, is_own
-
-MOST_VISITORS = 8  # at once
-PATIENCE_S = 5.0  # with a visitor who says nothing
+from recon.own_requests import LOOPBACK
+from recon.page_server import Answer, Refusal, Request
 
 
 class Preview:
@@ -84,63 +81,25 @@ def _draw(shown: NDArray[np.uint8], over: Over, step: int) -> None:
     cv2.circle(shown, (int(first[0]), int(first[1])), 5, colour, -1, cv2.LINE_AA)
 
 
-class _Handler(BaseHTTPRequestHandler):
+class _Site:
     """Answers `/`, `/state` and `/DEVICE.jpg`, and nothing else."""
 
-    preview: Preview
-    listens: str  # host where the server does
-    timeout = PATIENCE_S
+    def __init__(self, preview: Preview) -> None:
+        self._preview = preview
 
-    def do_GET(self) -> None:
+    def answer(self, request: Request) -> Answer | None:
         """Answer a request."""
-        path = self.path.partition("?")[0]
-        if not is_own(self.headers.get_all("Host", []), self.headers.get_all("Origin", []), self.listens):
-            self.send_error(HTTPStatus.FORBIDDEN, explain=FOREIGN)
-        elif path == "/":
-            self._send("text/html; charset=utf-8", files("recon.acquisition").joinpath("preview.html").read_bytes())
-        elif path == "/state":
-            self._send("application/json", json.dumps(self.preview.state()).encode())
-        elif path.endswith(".jpg") and (image := self.preview.jpeg(path[1:-4])) is not None:
-            self._send("image/jpeg", image)
-        else:
-            self.send_error(HTTPStatus.NOT_FOUND)
+        if request.method != "GET":
+            raise Refusal(HTTPStatus.METHOD_NOT_ALLOWED, "expected GET, as there is nothing to post to")
+        if request.path == "/":
+            return Answer("text/html; charset=utf-8", files("recon.acquisition").joinpath("preview.html").read_bytes())
+        if request.path == "/state":
+            return Answer("application/json", json.dumps(self._preview.state()).encode())
+        image = self._preview.jpeg(request.path[1:-4]) if request.path.endswith(".jpg") else None
+        return None if image is None else Answer("image/jpeg", image)
 
-    def _send(self, kind: str, content: bytes) -> None:
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(content)))
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Log nothing: a browser asks ten times a second."""
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = MOST_VISITORS
-
-    def __init__(self, address: tuple[str, int], handler: type[_Handler]) -> None:
-        self._places = threading.BoundedSemaphore(MOST_VISITORS)
-        super().__init__(address, handler)
-
-    def process_request(self, request, client_address) -> None:
-        """Answer in a thread, if there are not too many."""
-        if not self._places.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request, client_address) -> None:
-        """Answer; a visitor who went away is no fault."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._places.release()
-
-    def handle_error(self, request, client_address) -> None:
-        """Say nothing of a visitor who went away."""
+    def refused(self, peer: str, words: str) -> None:
+        """Say nothing of it: nothing is lost by a visitor who was sent away."""
 
 
 @contextmanager
@@ -152,15 +111,5 @@ def served(preview: Preview, host: str = LOOPBACK, port: int = 0) -> Iterator[st
     InputError
         If the port is taken, or the host isn't this computer's.
     """
-    handler = type("Handler", (_Handler,), {"preview": preview, "listens": host})
-    try:
-        server = _Server((host, port), handler)
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"preview: expected {host}:{port} to be free, found: {reason}; give preview.port=0") from None
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        yield f"http://{host}:{server.server_address[1]}/"
-    finally:
-        server.shutdown()
-        server.server_close()
+    with page_server.listen("preview", host, port).serving(_Site(preview)) as address:
+        yield address

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.skin_projection.lines_of_sight import NOWHERE, Sight, first_hits
 
 Array = NDArray[np.float64]
-Kind = Literal["mass", "cut", "scan", "name"]
+Kind = Literal["mass", "cut", "scan", "name", "stroke"]
 STEP_MM = 0.3  # between points of a curve: a chord leaves a circle of 5 mm by 0.002 mm
 OPEN = np.deg2rad(100)  # widest sector about the hole without skin
 

@@ -18,23 +18,22 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 from rich.console import Console
 
-from recon.capture import calibration_files, manifest, probe_files, tip_files
+from recon.capture import calibration_files, probe_files, tip_files
 from recon.capture.manifest import CAMERAS, SCANNER
 from recon.devices import playback
-from recon.devices.device_clocks import ClockFollower, follow
-from recon.devices.interfaces import Camera, DeviceError, Size
+from recon.devices.device_clocks import ClockFollower
+from recon.devices.interfaces import DeviceError, Size
 from recon.devices.openigtlink.igtl_server import PORT, Server
-from recon.devices.playback import PlayedCamera, PlayedScanner
 from recon.errors import InputError, did_you_mean
 from recon.model.part import Vector
 from recon.model.probe import ProbeCalibration, Speed
-from recon.model.rig import PATIENT, PROBE, Part, Positive
+from recon.model.rig import PATIENT, PROBE, Part
 from recon.model.tip import Tip
 from recon.model.tracks import LagSeconds, Track
 from recon.navigation import mass_distances, still_scene, tool_distances
@@ -47,26 +46,18 @@ from recon.navigation.publishing import Publisher, StillScene
 from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.navigation.tool_figures import Alarms
 from recon.probe_calibration import sound_in_water
-from recon.registry import Choice
 from recon.session import poses_step
 from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker
+from sonotwin import live_sources
 from sonotwin.console_watch import LineConsole
-from sonotwin.open_devices import Host, LiveDevices, of_a_laboratory, open_camera, open_scanner
+from sonotwin.live_sources import LiveFields, View, given_or_held
+from sonotwin.open_devices import Host, LiveDevices, open_scanner
 
 LOOK_S = 0.2  # between two looks whether all goes on
 SEARCH_S = 0.2  # between two searches for bodies that are lost, which take as long as several pairs
 PLAN_MM = 1.0, 1000.0  # least and most from a planned path's entry to its aim: others are in another unit
-
-
-class View(Part):
-    """The page in the browser."""
-
-    host: Host = LOOPBACK
-    """where it can be opened: on this computer alone; 0.0.0.0 lets all of the network in, without a password"""
-    port: Annotated[int, Field(ge=0, le=65535)] = 8080
-    """of TCP, another one for a second page, or where another program has this one; 0 takes any that is free"""
 
 
 class Igtl(Part):
@@ -80,25 +71,9 @@ class Igtl(Part):
     """of TCP: the one registered for OpenIGTLink; give another beside a PlusServer; 0 takes any that is free"""
 
 
-class Config(BodyFields):
+class Config(LiveFields, BodyFields):
     """Fields of `sonotwin navigate`."""
 
-    devices: Annotated[LiveDevices | None, Choice(None)] = None
-    """basler: two cameras and a scanner; copy conf/devices/basler.yaml for those of a laboratory"""
-    exposure_s: Positive = 0.01
-    """s, of cameras among the devices"""
-    gain: Positive = 1.0
-    """linear; 1 is the sensor's base gain"""
-    trigger: Literal["free", "hardware"] = "hardware"
-    """hardware: camera 1 runs free, its exposures trigger camera 2 by a wire; free: both run free"""
-    capture: Path | None = None
-    """folder, instead of devices: cam1, cam2 and us are played back in real time, round and round"""
-    sweep: str = ""
-    """name of the sweep with these, of a capture that holds several; "" takes the only one for the volume"""
-    speed: Annotated[float, Field(gt=0, le=10)] = 1.0
-    """of the playback, as a multiple of real time"""
-    apart_s: Positive | None = None
-    """s, by which a device of the capture may begin or end after another; null: a tenth of the sweep, and 1 s"""
     probe: Path | None = None
     """file: the probe's calibration, in place of the capture's own"""
     lag_s: LagSeconds = 0.0
@@ -129,11 +104,6 @@ class Config(BodyFields):
     seconds: Annotated[float, Field(gt=0)] | None = None
     """s, after which it ends; null goes on until Ctrl-C"""
 
-    @field_validator("devices", mode="before")
-    @classmethod
-    def _no_stand_ins(cls, given: Any) -> Any:
-        return of_a_laboratory(given, "a recorded or rendered sweep is played back by capture=FOLDER")
-
     @field_validator("plan")
     @classmethod
     def _two_points(cls, given: tuple[Vector, Vector] | None) -> tuple[Vector, Vector] | None:
@@ -141,12 +111,6 @@ class Config(BodyFields):
         if given is not None and not least <= (apart := np.linalg.norm(np.subtract(*given))) <= most:
             raise ValueError(f"expected an entry and an aim {least:g} to {most:g} mm apart, found {apart:.3g} mm")
         return given
-
-    @model_validator(mode="after")
-    def _one_source(self) -> "Config":
-        if (self.capture is None) == (self.devices is None):
-            raise ValueError(f"capture: expected it or devices, found {'neither' if self.capture is None else 'both'}")
-        return self
 
 
 class Sources(NamedTuple):
@@ -272,67 +236,36 @@ def sources_of(config: Config) -> Sources:
 
 def probe_of(config: Config) -> ProbeCalibration:
     """The probe's calibration, for the tissue: from its file, else from the capture."""
-    path = given_or_held(config, "probe", "the probe's calibration")
+    path = given_or_held(config.probe, config.capture, "probe", "the probe's calibration", "navigate")
     return sound_in_water.for_tissue(probe_files.read(path), config.tissue_m_s)
 
 
 def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker | BodyTracker:
     """The tracker, by the calibration of cameras of some sizes: from its file, else from the capture."""
-    known = calibration_files.read_for(given_or_held(config, "calibration", "the cameras' calibration"), sizes)
+    path = given_or_held(config.calibration, config.capture, "calibration", "the cameras' calibration", "navigate")
+    known = calibration_files.read_for(path, sizes)
     cameras, deep = (known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]), bits if bits > 8 else None
     if config.rig.bodies:
         return make_body_tracker(config, cameras, known.uncertainty, deep, SEARCH_S)
     return make_tracker(config, targets_of(config)[PROBE], cameras, known.uncertainty, deep)
 
 
-def given_or_held(config: Config, field: Literal["calibration", "probe"], what: str) -> Path:
-    """The file that a field names, else the capture's own."""
-    given: Path | None = getattr(config, field)
-    if given is not None:
-        return given
-    held = None if config.capture is None else getattr(manifest.read_manifest(config.capture), field)
-    if config.capture is None or held is None:
-        raise InputError(f"{config.capture or 'navigate'}: expected {what}, found none; give {field}=...")
-    return config.capture / held
-
-
 def played(config: Config, capture: Path) -> Sources:
     """Both cameras and the scanner of a capture, played back by one timeline."""
     recorded = playback.read_recording(capture, config.sweep)
-    line = playback.timeline_of(recorded, config.speed, config.apart_s)
-
-    def device(name: str, kind: type[PlayedCamera] | type[PlayedScanner]) -> Device:
-        return Device(name, lambda: kind(recorded[name], line), lambda source: lambda frame: line.clock_of(frame.time_ns))
-
-    cam1, cam2 = (device(name, PlayedCamera) for name in CAMERAS)
-    sizes, bits = {name: recorded[name].size for name in CAMERAS}, max(recorded[name].bits for name in CAMERAS)
-    return Sources(cam1, cam2, device(SCANNER, PlayedScanner), sizes, bits, recorded[SCANNER].size[0])
+    devices = live_sources.played(recorded, config)
+    sizes, bits = live_sources.sizes_of(recorded, CAMERAS)
+    return Sources(devices[CAMERAS[0]], devices[CAMERAS[1]], devices[SCANNER], sizes, bits, recorded[SCANNER].size[0])
 
 
 def opened(config: Config, devices: LiveDevices) -> Sources:
     """A laboratory's devices, opened when they are used, and again after a loss."""
-
-    def camera(name: str) -> Device:
-        def begun() -> Camera:
-            with ExitStack() as stack:
-                found = open_camera(devices, name)
-                stack.callback(found.close)
-                found.set_exposure(config.exposure_s, config.gain)
-                # camera 1's exposures trigger camera 2
-                found.start("hardware" if config.trigger == "hardware" and name != CAMERAS[0] else "free")
-                stack.pop_all()  # it is open, and its feed's to close
-                return found
-
-        return Device(name, begun, lambda source: FollowedClock(follow(cast(Camera, source))))
-
-    if lacking := [name for name in CAMERAS if name not in devices.cameras]:
-        raise InputError(f"devices.cameras: expected {' and '.join(CAMERAS)}, found no {lacking[0]}; see conf/devices")
+    cameras = live_sources.opened(devices, CAMERAS, config)
     chosen = devices.scanner
     scanner = (
         None
         if chosen is None
         else Device(SCANNER, lambda: open_scanner(chosen), lambda source: FollowedClock(ClockFollower(SCANNER)))
     )
-    sizes, bits = {name: devices.cameras[name].size for name in CAMERAS}, max(devices.cameras[name].bits for name in CAMERAS)
-    cam1, cam2 = map(camera, CAMERAS)
-    return Sources(cam1, cam2, scanner, sizes, bits, config.rig.probe.image_size[0])
+    sizes, bits = live_sources.sizes_of(devices, CAMERAS)
+    return Sources(cameras[CAMERAS[0]], cameras[CAMERAS[1]], scanner, sizes, bits, config.rig.probe.image_size[0])

@@ -28,7 +28,7 @@ from recon.navigation.navigation_record import RecordTable
 from recon.navigation.publishing import StillScene
 from recon.session import poses_step
 from recon.tracking import networks
-from sonotwin import choices, config
+from sonotwin import choices, config, live_sources
 from sonotwin.cli import main
 from sonotwin.verbs import navigate
 from tests.patience import PATIENCE_S
@@ -111,7 +111,7 @@ def test_a_camera_that_refuses_a_setting_is_closed(monkeypatch, refuses):
 
     monkeypatch.setattr(camera, refuses, refuse)
     monkeypatch.setattr(camera, "close", lambda: closed.append(True))
-    monkeypatch.setattr(navigate, "open_camera", lambda devices, name: camera)
+    monkeypatch.setattr(live_sources, "open_camera", lambda devices, name: camera)
     sources = navigate.sources_of(composed("devices=basler"))
     with pytest.raises(DeviceError, match=refuses):
         sources.cam1.open()
