@@ -14,7 +14,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest, SweepPa
 from recon.errors import Implausible, InputError
 from recon.files import atomic, json_text, metrics
 from recon.freehand.scans import TissueFields
-from recon.model.rig import Finite, NotNegative, Probe, Rig
+from recon.model.rig import PATIENT, Finite, NotNegative, Probe, Rig
 from recon.model.tracks import LagSeconds
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
@@ -81,6 +81,9 @@ class Settings(EchoFields, TissueFields, TargetField, BodyTargetFields, BoardLen
     """in the B-scans: masses, darker than the tissue around them; tube, round, in water, and the body about it; nothing"""
     overlays: bool = False
     """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
+    reference: Path | None = None
+    """file: the pose of the body `patient` at which the skin was measured, as of `sonotwin track`; null: as that finds it, in the
+    fringe images, or else in the first sweep over the patient"""
 
     @model_validator(mode="after")
     def _sigma_of_a_lag(self) -> "Settings":
@@ -137,7 +140,7 @@ def run(settings: Settings, out: Path, code: str, usual: Probe, command: Command
     """
     sources = Sources(settings, manifest.read_manifest(settings.capture), usual, watch, command)
     steps = Store(out, watch.announce, code)
-    files = settings.calibration, settings.target, settings.probe, settings.networks
+    files = settings.calibration, settings.target, settings.probe, settings.networks, settings.reference
     given = (*files, *settings.bars, *settings.measured.values())
     check(sources)
     with steps.opened([settings.capture, *given]):
@@ -313,10 +316,20 @@ def track_sweep(steps: Store, sources: Sources, name: str, optics: Path | None, 
     weights = settings.networks or networks.WEIGHTS
     measured = [*filter(None, [settings.target]), *settings.measured.values()]
     made_of = sources.files(sweep_part(name)) | _known_by(steps, "optics", optics, weights, *measured)
-    if settings.rig.bodies and sources.held.surface is not None:
-        made_of |= {"reference": sources.files("surface")}
+    if PATIENT in settings.rig.bodies and part.purpose in ("volume", None):
+        fields["reference"] = settings.reference or _earlier_reference(steps, sources, name)
+        told_by = [] if sources.held.surface is None else sources.files("surface")
+        made_of |= {"reference": told_by if fields["reference"] is None else files_of([fields["reference"]])}
     does, work = "poses of the probe, from frames", partial(poses_step.run, watch=sources.watch)
     return steps.do(step, does, poses_step.BY, poses_step.Settings, fields, work, made_of)
+
+
+def _earlier_reference(steps: Store, sources: Sources, name: str) -> Path | None:
+    """Where the patient stood in the first sweep, of a capture without fringes, so that all its sweeps are told in one world."""
+    if sources.held.surface is not None:
+        return None
+    done = [step for other in sources.sweeps if other != name and (step := _step_of("poses", other)) in steps.done]
+    return next((path for step in done if (path := steps.folder / step / poses_step.REFERENCE).is_file()), None)
 
 
 def measure_latency(steps: Store, sources: Sources, tracked: Mapping[str, Path | None]) -> KnownLag | None:
