@@ -29,6 +29,7 @@ from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import Rows
 from recon.estimation.levenberg_marquardt import Rules, descend
 from recon.estimation.parameters import Blocks
+from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -239,18 +240,6 @@ def least_misfit(enough: Callable[[float], bool], floor: float) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high
-
-
-def persistence(normalised: Array) -> float:
-    """Sum of the autocorrelation of residuals : (n, 3), of both signs of the delay, until it is lost in noise."""
-    n, total = len(normalised), 1.0
-    power = float((normalised**2).mean())
-    for delay in range(1, n // 3):
-        alike = float((normalised[delay:] * normalised[:-delay]).mean()) / power
-        if alike < 2 / np.sqrt(3 * (n - delay)):
-            break
-        total += 2 * alike
-    return total
 
 
 def symmetric_root(covariances: Array) -> Array:

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
+from recon.estimation.persistence import persistence
 from recon.geometry import rigid
-from recon.tip_calibration.pivot import Frames, mean_misfit, persistence
+from recon.tip_calibration.pivot import Frames, mean_misfit
 
 Array = NDArray[np.float64]
 
@@ -62,9 +63,9 @@ def calibrate(frames: Frames, name: str, tip: Array | None = None) -> Spin:
     used = np.ones(len(frames.poses), bool)
     axis, direction = _mean_axis(frames)
     for _ in range(ROUNDS):
-        axis, direction = _mean_axis(frames.some(used))
         angles = np.linalg.norm(frames.poses[:, :3, :3] @ axis - direction, axis=1)
         used = angles <= OUTLYING * np.median(angles) + FLOOR_RAD
+        axis, direction = _mean_axis(frames.some(used))
     some = frames.some(used)
     span = _span_deg(some, axis)
     if span < LEAST_SPAN_DEG:

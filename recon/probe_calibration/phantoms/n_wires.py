@@ -87,6 +87,7 @@ def figures(found: LineAdjustment) -> Metrics:
         "registration_off_deg": found.registration_off[0],
         "phantom_size": found.size[0],
         "phantom_size_sigma": found.size[1],
+        "frames_that_count_as_one": found.persistence,
         "more_lag_s": found.more_lag_s[0],
         "more_lag_sigma_s": found.more_lag_s[1],
     }
