@@ -22,7 +22,6 @@ from recon.tip_calibration.pivot import Frames, mean_misfit
 
 Array = NDArray[np.float64]
 
-LEAST_POSES = 20
 LEAST_SPAN_DEG = 60.0  # of the turn about the shaft
 MOST_WOBBLE_DEG = 1.0  # standard deviation of the shaft's direction about each of two axes
 MOST_SIGMA_DEG = 0.5
@@ -56,10 +55,6 @@ def calibrate(frames: Frames, name: str, tip: Array | None = None) -> Spin:
     InputError
         If it turns too little, or not about one axis that keeps its direction.
     """
-    if len(frames.poses) < LEAST_POSES:
-        raise InputError(
-            f"{name}: expected {LEAST_POSES} poses or more of a tool that turns about its shaft, found {len(frames.poses)}"
-        )
     used = np.ones(len(frames.poses), bool)
     axis, direction = _mean_axis(frames)
     for _ in range(ROUNDS):
