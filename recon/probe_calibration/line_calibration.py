@@ -29,14 +29,14 @@ from scipy.special import chdtrc, fdtrc
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
-from recon.estimation.levenberg_marquardt import descend
+from recon.estimation.levenberg_marquardt import USUAL, Rules, descend
 from recon.estimation.parameters import Blocks
 from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.wire_phantom import WirePhantom
-from recon.probe_calibration import movement, probe_checks
+from recon.probe_calibration import movement, probe_checks, wire_dots
 from recon.probe_calibration.movement import LEAST_FRAMES, LEAST_FREEDOM, PROBE, WIRES, Movement
 from recon.probe_calibration.point_calibration import MAX_FACTOR, MAX_RMS_MM, MIN_INLIERS, NAMED, SHIFT, Noise
 
@@ -47,6 +47,7 @@ Size = tuple[int, int]  # width, height, px
 MIN_FRAMES = 8  # also of a random start: eighteen unknowns, by three numbers a frame where there is one N-wire
 DRAWS = 100  # random frames; at 20 % outliers 0.8**8 = 17 % of them are clean
 REFINED = 3  # of these starts, the best
+REFINE = Rules(steps=8)  # of these, which need not converge
 ROUNDS = 20
 ARM_MM = 50.0  # of a registration: its standard deviation over this is that of its turns, as landmarks lie apart
 GATE = 13.8  # squared normalised residual of an outlier; exceeded by 1 of 1000 good dots (chi-square, 2)
@@ -64,7 +65,7 @@ SAME_SIZE = 0.005  # of a phantom, and its definition
 MAX_SIZE = 0.03  # beyond which it is another phantom
 NO_LAG_S = 0.005  # lag that isn't worth a word
 MOST_COURSES = 40  # of a sudden movement, evenly over the frames
-USUAL = np.array([*np.radians(np.full(3, 5.0)), *np.full(3, 5.0)])  # rad and mm, 1 sigma of half a movement beforehand
+LARGE = np.array([*np.radians(np.full(3, 5.0)), *np.full(3, 5.0)])  # rad and mm, 1 sigma of half a movement beforehand
 MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
 MOST_TRIED, DRAWS_TRIED = 24, 20  # frames and random starts, of a refusal
 UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
@@ -207,18 +208,10 @@ def _unknowns(wires: int) -> Blocks:
     return Blocks({"scale": 2, "probe": 6, "phantom": 6, "wires": 2 * wires})
 
 
-def _across(directions: Array) -> Array:
-    """Orthonormal vectors : (k, 2, 3) across unit vectors : (k, 3)."""
-    least = np.eye(3)[np.abs(directions).argmin(axis=1)]
-    first = np.cross(directions, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(directions, first)], axis=1)
-
-
 def _residuals(estimate: _Estimate, problem: _Problem) -> Array:
     """Distances : (n, k, 2) mm of the dots from their wires, in the plane across each."""
     offsets = estimate.in_phantom(problem.frames) - problem.phantom.points
-    return np.einsum("kij,nkj->nki", _across(problem.phantom.directions), offsets) - estimate.beside
+    return np.einsum("kij,nkj->nki", problem.phantom.normals, offsets) - estimate.beside
 
 
 def _closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
@@ -236,11 +229,9 @@ def _closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Arr
     target_from_image, scale, world_from_phantom : (..., 4, 4), (..., 2), (..., 4, 4)
     """
     rows = pixels.reshape(*pixels.shape[:-2], -1, 3, 2)
-    length = rows[..., 2, :] - rows[..., 0, :]
-    shares = ((rows[..., 1, :] - rows[..., 0, :]) * length).sum(axis=-1) / (length**2).sum(axis=-1)
     frame = np.stack([phantom.along, *phantom.across])  # right-handed
     middle = phantom.points.mean(axis=0)
-    points = (phantom.on_diagonals(shares) - middle) @ frame.T  # (..., n, p, 3)
+    points = (phantom.on_diagonals(wire_dots.shares(rows)) - middle) @ frame.T  # (..., n, p, 3)
     flat = np.ptp(phantom.sections[..., 1]) < FLAT_MM
     points = points[..., : 2 if flat else 3]
     turns, shifts = poses[..., None, :3, :3], poses[..., None, :3, 3]
@@ -304,7 +295,7 @@ def _refined_on_half(start: _Estimate, problem: _Problem) -> _Estimate:
     for _ in range(2):
         chosen = np.argsort(np.median((_residuals(start, problem) ** 2).sum(axis=-1), axis=1))[:keep]
         half = problem.of(chosen)
-        start = _fit(start, half, np.ones(half.frames.pixels.shape[:2], bool))
+        start = _fit(start, half, np.ones(half.frames.pixels.shape[:2], bool), rules=REFINE)
     return start
 
 
@@ -315,10 +306,8 @@ def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask, level: f
     """
     frames, noise = problem.frames, problem.noise
     n, k = frames.pixels.shape[:2]
-    pose = frames.pose_covariance
-    if pose is None:
-        pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
+    pose = noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
+    planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
     by_pose = (planes @ rigid.slopes(estimate.arms(frames))).reshape(n, 2 * k, 6)
     local = np.zeros((n, k, 3, 3))
     local[..., :2, :2] = frames.pixel_covariance * np.outer(estimate.scale, estimate.scale)
@@ -337,7 +326,7 @@ def _slopes(estimate: _Estimate, problem: _Problem) -> Array:
     n, k = frames.pixels.shape[:2]
     blocks = _unknowns(k)
     result = np.zeros((n, k, 2, len(blocks)))
-    turned = _across(phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
+    turned = phantom.normals @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
     places = place_slopes(estimate.target_from_image, estimate.scale, frames.pixels.reshape(-1, 2)).reshape(n, k, 3, -1)
     result[..., : len(NAMES)] = turned @ (frames.poses[:, None, :3, :3] @ places)
     apart = estimate.arms(frames) + frames.poses[:, None, :3, 3] - estimate.world_from_phantom[:3, 3]
@@ -366,9 +355,13 @@ def _normal_equations(estimate: _Estimate, problem: _Problem, inliers: Mask, lev
     return equations, float(np.sum(left**2) + problem.known @ departures**2)
 
 
-def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0) -> _Estimate:
+def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0, rules: Rules = USUAL) -> _Estimate:
     """Weighted least squares on some of the dots."""
-    return descend(start, lambda estimate: _normal_equations(estimate, problem, inliers, level), _Estimate.moved).estimate
+
+    def linearise(estimate: _Estimate) -> tuple[NormalEquations, float]:
+        return _normal_equations(estimate, problem, inliers, level)
+
+    return descend(start, linearise, _Estimate.moved, rules=rules).estimate
 
 
 def _squared(estimate: _Estimate, problem: _Problem, level: float) -> Array:
@@ -703,7 +696,7 @@ def _with_sigma(solved: _Solved, column: Array) -> tuple[float, float]:
 def _size(problem: _Problem, solved: _Solved) -> tuple[float, float]:
     """Size of the phantom beside its definition, as the motion of the probe has it, and its standard deviation."""
     middle = problem.phantom.points.mean(axis=0)
-    column = -np.einsum("kij,kj->ki", _across(problem.phantom.directions), problem.phantom.points - middle)
+    column = -np.einsum("kij,kj->ki", problem.phantom.normals, problem.phantom.points - middle)
     more, sigma = _with_sigma(solved, solved.whiten @ column.reshape(-1, 1))
     return 1 + more, sigma
 
@@ -714,7 +707,7 @@ def _lag_columns(problem: _Problem, found: _Fit, solved: _Solved) -> Array:
     assert rates is not None
     plane = (frames.pixels * estimate.scale) @ estimate.target_from_image[:3, :2].T + estimate.target_from_image[:3, 3]
     motion = plane @ np.swapaxes(rates[:, :3, :3], 1, 2) + rates[:, None, :3, 3]
-    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T
+    planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T
     return solved.whiten @ -np.einsum("kij,nkj->nki", planes, motion).reshape(*solved.left.shape, 1)
 
 
@@ -750,7 +743,7 @@ def _moved(solved: _Solved, what: str, growth: Array, block: slice, trials: int)
     """A movement of one kind and course, and the chance of as good a fit by noise in any of some trials."""
     columns = growth[:, None, None] * solved.slopes[..., block]
     change, free, information = _further(solved, columns)
-    half = inverse(information + np.diag(USUAL**-2)) @ information @ free
+    half = inverse(information + np.diag(LARGE**-2)) @ information @ free
     rest = solved.left + solved.slopes @ (change @ half) + columns @ half
     count, explained = persistence(rest), float(half @ information @ (2 * free - half))
     freedom = (solved.left.size - len(solved.known) - len(half)) / count
