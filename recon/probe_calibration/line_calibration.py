@@ -744,8 +744,12 @@ def _moved(solved: _Solved, what: str, growth: Array, block: slice, trials: int)
     columns = growth[:, None, None] * solved.slopes[..., block]
     change, free, information = _further(solved, columns)
     half = inverse(information + np.diag(LARGE**-2)) @ information @ free
-    rest = solved.left + solved.slopes @ (change @ half) + columns @ half
-    count, explained = persistence(rest), float(half @ information @ (2 * free - half))
+    unexplained = columns + solved.slopes @ change
+    rest = solved.left + unexplained @ half
+    pulls = np.einsum("nim,ni->nm", unexplained, rest)  # of each frame, whose dots may err alike
+    within = float(np.trace(inverse(information) @ pulls.T @ pulls)) / len(half)
+    alike, explained = persistence(rest), float(half @ information @ (2 * free - half))
+    count = alike * max(within, 1.0)
     freedom = (solved.left.size - len(solved.known) - len(half)) / count
     if freedom < LEAST_FREEDOM:
         return None
@@ -756,7 +760,7 @@ def _moved(solved: _Solved, what: str, growth: Array, block: slice, trials: int)
     kept, own = (change @ half)[: len(NAMES)], np.zeros(len(NAMES))
     if what == PROBE:
         own[block] = half
-    return _Named(found, np.outer(kept, kept) + np.outer(own, own), count)
+    return _Named(found, np.outer(kept, kept) + np.outer(own, own), alike)
 
 
 def pose_of(target_from_pixel: Array) -> tuple[Array, Array]:
