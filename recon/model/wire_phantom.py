@@ -7,6 +7,7 @@ Source: Comeau et al. 1998; Chen et al. 2009, Ultrasound in Medicine and Biology
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +34,6 @@ class WirePhantom:
 
     ends: Array  # (p, 3, 2, 3) mm: a side, the diagonal, the other side; front and back
     names: tuple[str, ...] = ()  # (3 p,)
-    reference_from_phantom: Array | None = None  # (4, 4), where it is known
     along: Array = field(init=False)  # (3,) of the sides, front to back
     across: Array = field(init=False)  # (2, 3) orthonormal: of the rows, and between them
 
@@ -97,6 +97,14 @@ class WirePhantom:
         lines = (self.ends[:, :, 1] - self.ends[:, :, 0]).reshape(-1, 3)
         return lines / np.linalg.norm(lines, axis=1, keepdims=True)
 
+    @cached_property
+    def normals(self) -> Array:
+        """Orthonormal vectors : (3 p, 2, 3) across each wire."""
+        least = np.eye(3)[np.abs(self.directions).argmin(axis=1)]
+        first = np.cross(self.directions, least)
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        return np.stack([first, np.cross(self.directions, first)], axis=1)
+
     @property
     def sections(self) -> Array:
         """Places : (p, 2, 2) mm of the sides, in a plane across them: along the row, and between rows."""
@@ -104,11 +112,8 @@ class WirePhantom:
 
     def on_diagonals(self, shares: Array) -> Array:
         """Points : (..., p, 3) mm of the diagonals that lie at shares : (..., p) of the way from the first side to the other."""
-        first, other = self.ends[:, 0, 0], self.ends[:, 2, 0]
-        row = self.across[0]
         begin, end = self.ends[:, 1, 0], self.ends[:, 1, 1]
-        reach = (other - first) @ row
-        at_front, at_back = ((each - first) @ row / reach for each in (begin, end))
+        at_front, at_back = self.shares_of_ends().T
         return begin + ((shares - at_front) / (at_back - at_front))[..., None] * (end - begin)
 
     def restrung(self, rows: list[int]) -> "WirePhantom":

@@ -10,26 +10,34 @@ The middle dots are places in the phantom by themselves (see `recon.model.wire_p
 of the phantom's pose and nine of the image's. Least median of squares over random frames stands wrong dots.
 
 All dots of a frame share the error of its pose, so a frame's equations are weighted by their full covariance. Of a frame single
-dots can be outliers.
+dots can be outliers. Where residuals of neighbouring frames are alike, as in the distorted field of a magnetic tracker, frames
+count as fewer.
+
+Further unknowns, each with its own columns beside those of the adjustment, show mistakes: another size of the phantom, a lag of
+the B-scans, a movement of the probe against its target or of the phantom, evenly or all at once (see `movement`).
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc, fdtrc
 
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
-from recon.estimation.levenberg_marquardt import descend
+from recon.estimation.levenberg_marquardt import USUAL, Rules, descend
 from recon.estimation.parameters import Blocks
+from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.wire_phantom import WirePhantom
-from recon.probe_calibration import probe_checks
+from recon.probe_calibration import movement, probe_checks, wire_dots
+from recon.probe_calibration.movement import LEAST_FRAMES, LEAST_FREEDOM, PROBE, WIRES, Movement
 from recon.probe_calibration.point_calibration import MAX_FACTOR, MAX_RMS_MM, MIN_INLIERS, NAMED, SHIFT, Noise
 
 Array = NDArray[np.float64]
@@ -39,6 +47,7 @@ Size = tuple[int, int]  # width, height, px
 MIN_FRAMES = 8  # also of a random start: eighteen unknowns, by three numbers a frame where there is one N-wire
 DRAWS = 100  # random frames; at 20 % outliers 0.8**8 = 17 % of them are clean
 REFINED = 3  # of these starts, the best
+REFINE = Rules(steps=8)  # of these, which need not converge
 ROUNDS = 20
 ARM_MM = 50.0  # of a registration: its standard deviation over this is that of its turns, as landmarks lie apart
 GATE = 13.8  # squared normalised residual of an outlier; exceeded by 1 of 1000 good dots (chi-square, 2)
@@ -48,11 +57,15 @@ FLOOR_MM = 1e-3  # no dot counts as more exact than this
 LEAST_SHOWN = 1e-9  # of what a further unknown changes, that no other explains: less is rounding
 HELD = 1e15  # information on unknowns that stay
 FAR_MM = 1e3  # 1 sigma of dots that are left out
+NEIGHBOURS = 4.0  # that count as one, from which on it is told
 ALIKE = 1.5  # squared residuals of arrangements beside the best, of which the registration chooses
 SURE = 5.0  # standard deviations from which on an unusual value is told
+CHANCE = float(chdtrc(1, SURE**2))  # of as much by noise: of a movement
 SAME_SIZE = 0.005  # of a phantom, and its definition
 MAX_SIZE = 0.03  # beyond which it is another phantom
 NO_LAG_S = 0.005  # lag that isn't worth a word
+MOST_COURSES = 40  # of a sudden movement, evenly over the frames
+LARGE = np.array([*np.radians(np.full(3, 5.0)), *np.full(3, 5.0)])  # rad and mm, 1 sigma of half a movement beforehand
 MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
 MOST_TRIED, DRAWS_TRIED = 24, 20  # frames and random starts, of a refusal
 UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
@@ -195,18 +208,10 @@ def _unknowns(wires: int) -> Blocks:
     return Blocks({"scale": 2, "probe": 6, "phantom": 6, "wires": 2 * wires})
 
 
-def _across(directions: Array) -> Array:
-    """Orthonormal vectors : (k, 2, 3) across unit vectors : (k, 3)."""
-    least = np.eye(3)[np.abs(directions).argmin(axis=1)]
-    first = np.cross(directions, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(directions, first)], axis=1)
-
-
 def _residuals(estimate: _Estimate, problem: _Problem) -> Array:
     """Distances : (n, k, 2) mm of the dots from their wires, in the plane across each."""
     offsets = estimate.in_phantom(problem.frames) - problem.phantom.points
-    return np.einsum("kij,nkj->nki", _across(problem.phantom.directions), offsets) - estimate.beside
+    return np.einsum("kij,nkj->nki", problem.phantom.normals, offsets) - estimate.beside
 
 
 def _closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
@@ -224,11 +229,9 @@ def _closed_form(phantom: WirePhantom, poses: Array, pixels: Array) -> tuple[Arr
     target_from_image, scale, world_from_phantom : (..., 4, 4), (..., 2), (..., 4, 4)
     """
     rows = pixels.reshape(*pixels.shape[:-2], -1, 3, 2)
-    length = rows[..., 2, :] - rows[..., 0, :]
-    shares = ((rows[..., 1, :] - rows[..., 0, :]) * length).sum(axis=-1) / (length**2).sum(axis=-1)
     frame = np.stack([phantom.along, *phantom.across])  # right-handed
     middle = phantom.points.mean(axis=0)
-    points = (phantom.on_diagonals(shares) - middle) @ frame.T  # (..., n, p, 3)
+    points = (phantom.on_diagonals(wire_dots.shares(rows)) - middle) @ frame.T  # (..., n, p, 3)
     flat = np.ptp(phantom.sections[..., 1]) < FLAT_MM
     points = points[..., : 2 if flat else 3]
     turns, shifts = poses[..., None, :3, :3], poses[..., None, :3, 3]
@@ -292,7 +295,7 @@ def _refined_on_half(start: _Estimate, problem: _Problem) -> _Estimate:
     for _ in range(2):
         chosen = np.argsort(np.median((_residuals(start, problem) ** 2).sum(axis=-1), axis=1))[:keep]
         half = problem.of(chosen)
-        start = _fit(start, half, np.ones(half.frames.pixels.shape[:2], bool))
+        start = _fit(start, half, np.ones(half.frames.pixels.shape[:2], bool), rules=REFINE)
     return start
 
 
@@ -303,10 +306,8 @@ def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask, level: f
     """
     frames, noise = problem.frames, problem.noise
     n, k = frames.pixels.shape[:2]
-    pose = frames.pose_covariance
-    if pose is None:
-        pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
-    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
+    pose = noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
+    planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
     by_pose = (planes @ rigid.slopes(estimate.arms(frames))).reshape(n, 2 * k, 6)
     local = np.zeros((n, k, 3, 3))
     local[..., :2, :2] = frames.pixel_covariance * np.outer(estimate.scale, estimate.scale)
@@ -325,7 +326,7 @@ def _slopes(estimate: _Estimate, problem: _Problem) -> Array:
     n, k = frames.pixels.shape[:2]
     blocks = _unknowns(k)
     result = np.zeros((n, k, 2, len(blocks)))
-    turned = _across(phantom.directions) @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
+    turned = phantom.normals @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3)
     places = place_slopes(estimate.target_from_image, estimate.scale, frames.pixels.reshape(-1, 2)).reshape(n, k, 3, -1)
     result[..., : len(NAMES)] = turned @ (frames.poses[:, None, :3, :3] @ places)
     apart = estimate.arms(frames) + frames.poses[:, None, :3, 3] - estimate.world_from_phantom[:3, 3]
@@ -354,9 +355,13 @@ def _normal_equations(estimate: _Estimate, problem: _Problem, inliers: Mask, lev
     return equations, float(np.sum(left**2) + problem.known @ departures**2)
 
 
-def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0) -> _Estimate:
+def _fit(start: _Estimate, problem: _Problem, inliers: Mask, level: float = 1.0, rules: Rules = USUAL) -> _Estimate:
     """Weighted least squares on some of the dots."""
-    return descend(start, lambda estimate: _normal_equations(estimate, problem, inliers, level), _Estimate.moved).estimate
+
+    def linearise(estimate: _Estimate) -> tuple[NormalEquations, float]:
+        return _normal_equations(estimate, problem, inliers, level)
+
+    return descend(start, linearise, _Estimate.moved, rules=rules).estimate
 
 
 def _squared(estimate: _Estimate, problem: _Problem, level: float) -> Array:
@@ -410,16 +415,13 @@ class LineAdjustment:
     more_lag_s: tuple[float, float]  # of the B-scans, beyond that of the poses, and its standard deviation; NaN if unknown
     held_out_mm: float  # RMS of dots of half of the frames, by the other half
     earlier_held_out_mm: float = np.nan  # the same by an earlier calibration; NaN without one
-
-    @property
-    def moved(self) -> None:
-        """Nothing that is looked for: distorted fields of magnetic trackers look like a bracket that gives."""
-        return None
+    moved: Movement | None = None  # of the probe or the phantom, which the covariance allows for
+    persistence: float = 1.0  # frames that count as one in the covariance, as residuals of neighbours are alike
 
     @property
     def outliers(self) -> Mask:
         """Frames : (n,) of which half of the dots or more are left out."""
-        return self.inliers.mean(axis=1) <= 0.5
+        return ~_used(self.inliers)
 
     @property
     def rms_mm(self) -> float:
@@ -460,10 +462,39 @@ class LineAdjustment:
         size, sigma = self.size
         if abs(size - 1) > max(SURE * sigma, SAME_SIZE):
             yield f"by the poses the phantom is {100 * (size - 1):+.1f} ± {100 * sigma:.1f} % larger than its definition"
-        lag, sigma = self.more_lag_s
-        if abs(lag) > max(SURE * sigma, NO_LAG_S):
-            off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
-            yield f"the B-scans are {off} beyond lag_s: add {lag:+.3f} to it, or hold still"
+        if self.moved is not None:
+            yield _described(self.moved)
+        if _is_late(self.more_lag_s):
+            yield _described_lag(self.more_lag_s)
+        elif self.persistence > NEIGHBOURS:
+            cause = "poses err from place to place, or something moves slowly"
+            yield f"{self.persistence:.0f} neighbouring frames count as one, since their residuals are alike: {cause}"
+
+
+def _used(inliers: Mask) -> Mask:
+    """Frames : (n,) of which most dots are inliers : (n, k)."""
+    return inliers.mean(axis=1) > 0.5
+
+
+def _is_late(more_lag_s: tuple[float, float]) -> bool:
+    """Whether a lag is worth a word, by its standard deviation."""
+    lag, sigma = more_lag_s
+    return abs(lag) > max(SURE * sigma, NO_LAG_S)
+
+
+def _described_lag(more_lag_s: tuple[float, float]) -> str:
+    lag, sigma = more_lag_s
+    off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
+    return f"the B-scans are {off} beyond lag_s: add {lag:+.3f} to it, or hold still"
+
+
+def _described(moved: Movement) -> str:
+    what, cause = {
+        PROBE: ("probe moved against its target", "a bracket that gives or slips"),
+        WIRES: ("phantom moved", "a phantom or tank that was pushed"),
+    }[moved.what]
+    by = f"{moved.turn_deg:.2f} deg and {moved.shift_mm:.2f} mm between the first frame and the last (chance {moved.chance:.0e})"
+    return f"the residuals show that the {what} by {by}: {cause}, or poses that err from place to place"
 
 
 def calibrate(
@@ -490,7 +521,8 @@ def calibrate(
     seed : int
         Of the random draws of frames for the robust start.
     max_sigma_mm : float
-        Standard deviation of a pixel's place beyond which the outcome is refused.
+        Standard deviation of a pixel's place beyond which the outcome is refused, by noise and lag. What warnings tell of is in
+        the covariance, too.
     numbers : (n,)
         Of the frames, for messages; from 0 on without them.
     earlier : (4, 4)
@@ -515,22 +547,28 @@ def calibrate(
     several = np.repeat(problem.frames.poses, problem.phantom.count, axis=0), problem.frames.pixels.reshape(-1, 2)
     if wires.registration is None:
         probe_checks.motion(*several, size)
-    sizes, lag = _size(problem, found), _more_lag(problem, found)
+    solved = _solve(problem, found)
+    sizes, lag = _size(problem, solved), _more_lag(problem, found, solved)
     if abs(sizes[0] - 1) > max(SURE * sizes[1], MAX_SIZE):
         raise InputError(
             f"wires: expected a phantom of the size that the probe's motion asks for, found it {100 * (sizes[0] - 1):+.1f} ± "
             f"{100 * sizes[1]:.1f} % larger: another phantom than defined, or poses of another unit or scale"
         )
-    estimate, covariance = found.estimate, _covariance(problem, found)
+    named = None if _is_late(lag) else _movement(solved, _used(found.inliers))
+    count = persistence(solved.left) if named is None else named.persistence
+    estimate, by_lag = found.estimate, np.zeros(len(NAMES))
     if sightings.lag_sigma_s and problem.frames.pose_rates is not None:
-        by_lag = _by_column(problem, found, _lag_column(problem, found))[0][: len(NAMES)] * sightings.lag_sigma_s
-        covariance += np.outer(by_lag, by_lag)
+        by_lag = _further(solved, _lag_columns(problem, found, solved))[0][: len(NAMES), 0] * sightings.lag_sigma_s
     try:
-        frames = _Placed(*several)
-        probe_checks.certainty(estimate.target_from_image, estimate.scale, covariance, frames, size, max_sigma_mm)
+        frames, own = _Placed(*several), _covariance(solved, 1.0) + np.outer(by_lag, by_lag)
+        probe_checks.certainty(estimate.target_from_image, estimate.scale, own, frames, size, max_sigma_mm)
     except InputError as error:
-        late = "; the uncertainty of the lag is in it: hold still, or measure the lag" if sightings.lag_sigma_s else ""
-        raise InputError(f"{error}{late}") from None
+        late = "the uncertainty of the lag is in it: hold still, or measure the lag" if sightings.lag_sigma_s else ""
+        also = _described_lag(lag) if _is_late(lag) else late
+        raise InputError(f"{error}; {also}" if also else str(error)) from None
+    covariance = _covariance(solved, count) + np.outer(by_lag, by_lag)
+    if named is not None:
+        covariance += named.squared
     covariance[SHIFT, SHIFT] += wires.echo_ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     ahead = rigid.transform(np.eye(3), [0, -wires.echo_ahead_mm, 0])
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
@@ -549,6 +587,8 @@ def calibrate(
         lag,
         _held_out(problem, found, found.estimate),
         np.nan if earlier is None else _held_out_by(problem, found, earlier),
+        None if named is None else named.movement,
+        count,
     )
 
 
@@ -599,44 +639,128 @@ def _rms(distances: Array) -> float:
     return float(np.sqrt((distances**2).sum(axis=-1).mean()))
 
 
-def _by_column(problem: _Problem, found: _Fit, column: Array) -> tuple[Array, float, float]:
-    """Change : (g,) of the unknowns by one unit of a further one, whose slopes : (n, k, 2) are given; its value and its sigma."""
-    by_unknowns, left = _whitened(found.estimate, problem, found.inliers, found.level)
-    root = whitening(_covariances(found.estimate, problem, found.inliers, found.level))
-    more = (root @ column.reshape(*left.shape, 1))[..., 0].ravel()
-    flat, rest = by_unknowns.reshape(-1, by_unknowns.shape[-1]), left.ravel()
-    spread = inverse(flat.T @ flat + np.diag(problem.known))
-    change = -spread @ (flat.T @ more)
-    free = more + flat @ change
-    information = float(more @ free)
-    if information < LEAST_SHOWN * float(more @ more):
-        return change, 0.0, np.inf
-    return change, -float(free @ rest) / information, 1 / np.sqrt(information)
+class _Solved(NamedTuple):
+    """Whitened equations of n frames at the adjusted values."""
+
+    slopes: Array  # (n, 2 k, g) of the residuals by the unknowns
+    left: Array  # (n, 2 k) residuals
+    whiten: Array  # (n, 2 k, 2 k)
+    known: Array  # (g,) information beforehand
+    spread: Array  # (g, g) covariance of the unknowns, of independent frames
+
+    @property
+    def rows(self) -> Array:
+        """Slopes : (2 n k, g)."""
+        return self.slopes.reshape(-1, self.slopes.shape[-1])
 
 
-def _size(problem: _Problem, found: _Fit) -> tuple[float, float]:
+class _Named(NamedTuple):
+    """A movement that residuals show."""
+
+    movement: Movement
+    squared: Array  # (8, 8) mean square by it of sx, sy and the probe's pose, over both ends
+    persistence: float  # of the residuals without it
+
+
+def _solve(problem: _Problem, found: _Fit) -> _Solved:
+    """The equations at an adjustment."""
+    slopes, left = _whitened(found.estimate, problem, found.inliers, found.level)
+    whiten = whitening(_covariances(found.estimate, problem, found.inliers, found.level))
+    flat = slopes.reshape(-1, slopes.shape[-1])
+    return _Solved(slopes, left, whiten, problem.known, inverse(flat.T @ flat + np.diag(problem.known)))
+
+
+def _further(solved: _Solved, columns: Array) -> tuple[Array, Array, Array]:
+    """Adjust m further unknowns, of whitened slopes : (n, 2 k, m), with all others.
+
+    Returns
+    -------
+    change : (g, m) of the others by one unit of each
+    values : (m,)
+    information : (m, m) on them, of independent frames
+    """
+    more = columns.reshape(solved.left.size, -1)
+    change = -solved.spread @ (solved.rows.T @ more)
+    information = more.T @ (more + solved.rows @ change)
+    if (np.diag(information) < LEAST_SHOWN * (more**2).sum(axis=0)).any():
+        return change, np.zeros(more.shape[1]), np.zeros_like(information)
+    return change, -inverse(information) @ (more.T @ solved.left.ravel()), information
+
+
+def _with_sigma(solved: _Solved, column: Array) -> tuple[float, float]:
+    """One further unknown, whose whitened slopes : (n, 2 k, 1) are given, and its standard deviation."""
+    _, (value,), ((information,),) = _further(solved, column)
+    return float(value), float(np.sqrt(persistence(solved.left) / information)) if information else np.inf
+
+
+def _size(problem: _Problem, solved: _Solved) -> tuple[float, float]:
     """Size of the phantom beside its definition, as the motion of the probe has it, and its standard deviation."""
     middle = problem.phantom.points.mean(axis=0)
-    column = -np.einsum("kij,kj->ki", _across(problem.phantom.directions), problem.phantom.points - middle)
-    _, more, sigma = _by_column(problem, found, np.broadcast_to(column, (*found.inliers.shape, 2)))
+    column = -np.einsum("kij,kj->ki", problem.phantom.normals, problem.phantom.points - middle)
+    more, sigma = _with_sigma(solved, solved.whiten @ column.reshape(-1, 1))
     return 1 + more, sigma
 
 
-def _lag_column(problem: _Problem, found: _Fit) -> Array:
-    """Slopes : (n, k, 2) of the residuals, mm a second of lag."""
+def _lag_columns(problem: _Problem, found: _Fit, solved: _Solved) -> Array:
+    """Whitened slopes : (n, 2 k, 1) of the residuals, a second of lag."""
     rates, frames, estimate = problem.frames.pose_rates, problem.frames, found.estimate
     assert rates is not None
     plane = (frames.pixels * estimate.scale) @ estimate.target_from_image[:3, :2].T + estimate.target_from_image[:3, 3]
     motion = plane @ np.swapaxes(rates[:, :3, :3], 1, 2) + rates[:, None, :3, 3]
-    planes = _across(problem.phantom.directions) @ estimate.world_from_phantom[:3, :3].T
-    return -np.einsum("kij,nkj->nki", planes, motion)
+    planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T
+    return solved.whiten @ -np.einsum("kij,nkj->nki", planes, motion).reshape(*solved.left.shape, 1)
 
 
-def _more_lag(problem: _Problem, found: _Fit) -> tuple[float, float]:
+def _more_lag(problem: _Problem, found: _Fit, solved: _Solved) -> tuple[float, float]:
     """Lag of the B-scans that the residuals show, s, and its standard deviation; NaN without times, or at rest."""
     if problem.frames.pose_rates is None or not np.abs(problem.frames.pose_rates).any():
         return np.nan, np.nan
-    return _by_column(problem, found, _lag_column(problem, found))[1:]
+    return _with_sigma(solved, _lag_columns(problem, found, solved))
+
+
+def _movement(solved: _Solved, used: Mask) -> _Named | None:
+    """The likeliest movement of the probe or the phantom; None where noise that is alike in neighbours may be all.
+
+    used : (n,) frames that aren't outliers, of which some are before a sudden movement and some after it
+    """
+    n, blocks = len(used), _unknowns(solved.left.shape[1] // 2)
+    inside = np.flatnonzero(used)[LEAST_FRAMES : 1 - LEAST_FRAMES]
+    firsts = np.unique(inside[np.linspace(0, len(inside) - 1, MOST_COURSES).astype(int)])
+    courses = [np.linspace(-1, 1, n), *(np.where(np.arange(n) < first, -1.0, 1.0) for first in firsts)]
+    likeliest = {}
+    for what, block in ((PROBE, blocks["probe"]), (WIRES, blocks["phantom"])):
+        fits = [_moved(solved, what, growth, block, 2 * len(courses)) for growth in courses]
+        sure = [one for one in fits if one is not None and one.movement.chance < CHANCE]
+        if sure:
+            likeliest[what] = min(sure, key=lambda one: one.movement.log_chance)
+    if len(likeliest) < 2:
+        return next(iter(likeliest.values()), None)
+    sooner = likeliest[WIRES].movement.evidence - movement.CAUTION > likeliest[PROBE].movement.evidence
+    return likeliest[WIRES if sooner else PROBE]
+
+
+def _moved(solved: _Solved, what: str, growth: Array, block: slice, trials: int) -> _Named | None:
+    """A movement of one kind and course, and the chance of as good a fit by noise in any of some trials."""
+    columns = growth[:, None, None] * solved.slopes[..., block]
+    change, free, information = _further(solved, columns)
+    half = inverse(information + np.diag(LARGE**-2)) @ information @ free
+    unexplained = columns + solved.slopes @ change
+    rest = solved.left + unexplained @ half
+    pulls = np.einsum("nim,ni->nm", unexplained, rest)  # of each frame, whose dots may err alike
+    within = float(np.trace(inverse(information) @ pulls.T @ pulls)) / len(half)
+    alike, explained = persistence(rest), float(half @ information @ (2 * free - half))
+    count = alike * max(within, 1.0)
+    freedom = (solved.left.size - len(solved.known) - len(half)) / count
+    if freedom < LEAST_FREEDOM:
+        return None
+    after = max(float((solved.left**2).sum()) - explained, np.finfo(float).tiny) / count
+    chance = fdtrc(len(half), freedom, explained / count / len(half) / (after / freedom))
+    log_chance = float(np.log(trials) + np.log(np.maximum(chance, np.finfo(float).tiny)))
+    found = Movement(what, half, log_chance, explained / count / 2, np.ones(len(growth), bool))
+    kept, own = (change @ half)[: len(NAMES)], np.zeros(len(NAMES))
+    if what == PROBE:
+        own[block] = half
+    return _Named(found, np.outer(kept, kept) + np.outer(own, own), alike)
 
 
 def pose_of(target_from_pixel: Array) -> tuple[Array, Array]:
@@ -646,11 +770,12 @@ def pose_of(target_from_pixel: Array) -> tuple[Array, Array]:
     return rigid.nearest(rigid.transform(np.column_stack([axes, np.cross(*axes.T)]), target_from_pixel[:3, 3])), scale
 
 
-def _covariance(problem: _Problem, found: _Fit) -> Array:
-    """Of sx, sy and the probe's pose : (8, 8), whatever phantom and wires are within what is known of them."""
-    by_unknowns, _ = _whitened(found.estimate, problem, found.inliers, found.level)
-    flat = by_unknowns.reshape(-1, by_unknowns.shape[-1])
-    return inverse(flat.T @ flat + np.diag(problem.known))[: len(NAMES), : len(NAMES)]
+def _covariance(solved: _Solved, count: float) -> Array:
+    """Of sx, sy and the probe's pose : (8, 8), whatever phantom and wires are within what is known of them.
+
+    count : frames that count as one
+    """
+    return inverse(solved.rows.T @ solved.rows / count + np.diag(solved.known))[: len(NAMES), : len(NAMES)]
 
 
 def _held_out_by(problem: _Problem, found: _Fit, target_from_pixel: Array) -> float:

@@ -25,12 +25,11 @@ class PlusPhantom:
     """A phantom, and what a configuration has on where it is and on the probe."""
 
     wires: WirePhantom
-    name: str  # of the file, for messages
     reference_from_phantom: Array | None = None  # (4, 4) mm
     target_from_pixel: Array | None = None  # (4, 4) from px to mm, of a calibration that was there before
 
 
-FCAL = PlusPhantom(WirePhantom(np.array(FCAL_2, float)), "PLUS's phantom fCal 2")
+FCAL = PlusPhantom(WirePhantom(np.array(FCAL_2, float)))  # PLUS's phantom fCal 2
 
 
 def read(path: Path, reference: str | None = None) -> PlusPhantom:
@@ -61,7 +60,7 @@ def read(path: Path, reference: str | None = None) -> PlusPhantom:
     registered = None if reference is None else _transform(path, root, PHANTOM, reference)
     if registered is not None and (found := rigid.fault(registered)):
         raise fault(path, f"{PHANTOM}To{reference}", rigid.RIGID, found)
-    return PlusPhantom(phantom, str(path), registered, _transform(path, root, "Image", "Probe"))
+    return PlusPhantom(phantom, registered, _transform(path, root, "Image", "Probe"))
 
 
 def _point(path: Path, wire: Element, name: str) -> Array:

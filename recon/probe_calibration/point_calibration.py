@@ -71,6 +71,11 @@ class Noise:
     pixel_px: float = 0.5  # of the crossing in the B-scan
     slice_mm: float = 0.2  # of the crossing across the image plane: the slice is thick, so the crossing shines from beside it
 
+    @property
+    def of_pose(self) -> Array:
+        """Covariance : (6, 6) of a pose, rad and mm."""
+        return np.diag([np.radians(self.angle_deg) ** 2] * 3 + [self.position_mm**2] * 3)
+
 
 @dataclass(frozen=True)
 class Sightings:
@@ -384,9 +389,7 @@ def _residuals(estimate: _Estimate, sightings: Sightings) -> Array:
 def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     """Of the residuals : (n, 3, 3) mm^2: the pose's, with its lever, and in the image's axes the crossing's."""
     n = len(sightings.pixels)
-    pose = sightings.pose_covariance
-    if pose is None:
-        pose = np.diag([np.radians(noise.angle_deg) ** 2] * 3 + [noise.position_mm**2] * 3)
+    pose = noise.of_pose if sightings.pose_covariance is None else sightings.pose_covariance
     lever = rigid.slopes(estimate.arms(sightings))
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance

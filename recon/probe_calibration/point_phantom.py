@@ -60,7 +60,9 @@ def figures(found: Adjustment) -> Metrics:
 
 
 def describe(found: Adjustment, settings: Settings) -> Iterator[str]:
-    """The wires, where they were seen as lines."""
+    """The wires, where they were seen as lines, and what moved."""
     if found.apart_mm:
         ahead = f"their echo taken {settings.echo_ahead_mm:.2f} mm before their axes"
         yield f"wires       seen as lines, the axes {found.apart_mm:.2f} mm apart; {ahead}"
+    if found.moved is not None:
+        yield f"warning     {found.moved.described}"

@@ -18,7 +18,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
-LAST = 3  # frames, too few to find a sudden movement by
+EDGE = 3  # frames, too few to find a sudden movement by
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
 FREEZING_F = 32.0  # degrees Fahrenheit
@@ -111,10 +111,10 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
         yield f"warning     {doubt}"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
-    if found.outliers[-LAST:].all():
-        yield f"warning     the last {LAST} frames are outliers: if the bracket slipped before them, the result is of before"
-    if found.moved is not None:
-        yield f"warning     {found.moved.described}"
+    for which, end, there in (("last", slice(-EDGE, None), "before"), ("first", slice(EDGE), "after")):
+        if found.outliers[end].all():
+            slipped = f"if the bracket slipped {there} them, the result is of {there}"
+            yield f"warning     the {which} {EDGE} frames are outliers: {slipped}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
     yield from _describe_sound(figures, settings)
 

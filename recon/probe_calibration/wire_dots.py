@@ -178,7 +178,7 @@ def _rows_of_three(centres: Array, phantom: WirePhantom) -> NDArray[np.int64]:
 
 def _arranged(echoes: _Echoes, rows: NDArray[np.int64], phantom: WirePhantom) -> tuple[NDArray[np.int64], Array]:
     """Dots by wire : (a, 3 p) that look as the phantom does, the likeliest first, and their costs : (a,) as squares of sigmas."""
-    share, sides = _shares(echoes.centres[rows]), echoes.centres[rows[:, ::2]]
+    share, sides = shares(echoes.centres[rows]), echoes.centres[rows[:, ::2]]
     reach = np.sort(phantom.shares_of_ends(), axis=1)
     fit = [np.flatnonzero((share > low - BEYOND) & (share < high + BEYOND)) for low, high in reach]
     widths, along = phantom.sections[:, 1, 0] - phantom.sections[:, 0, 0], sides[:, 1] - sides[:, 0]
@@ -209,10 +209,10 @@ def _parallel(one: Array, other: Array) -> tuple[NDArray[np.int64], NDArray[np.i
     return first, second
 
 
-def _shares(dots: Array) -> Array:
-    """Shares : (n,) of the way from the first of three dots : (n, 3, 2) to the last, at which the second lies."""
-    length = dots[:, 2] - dots[:, 0]
-    return ((dots[:, 1] - dots[:, 0]) * length).sum(axis=1) / (length**2).sum(axis=1)
+def shares(dots: Array) -> Array:
+    """Shares : (...) of the way from the first of three dots : (..., 3, 2) to the last, at which the second lies."""
+    length = dots[..., 2, :] - dots[..., 0, :]
+    return ((dots[..., 1, :] - dots[..., 0, :]) * length).sum(axis=-1) / (length**2).sum(axis=-1)
 
 
 def _affine(sides: Array, sections: Array) -> tuple[Array, Array]:

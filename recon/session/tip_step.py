@@ -209,6 +209,8 @@ def with_axis(made: Calibrated, settings: Settings, watch: Watch = SILENT) -> Ca
     """The same with the shaft's direction, if a second film or a drawing gives it."""
     if settings.axis is not None:
         axis = np.array(settings.axis) / np.linalg.norm(settings.axis)
+        if axis @ made.tip.tip_mm < 0:
+            watch.say("warning     axis= points away from the tip, seen from the target: expected from the handle to the tip")
         covariance = np.radians(settings.axis_sigma_deg) ** 2 * (np.eye(3) - np.outer(axis, axis))
         return _joined(made, axis, covariance, {"sigma_axis_deg": settings.axis_sigma_deg * np.sqrt(2)})
     if settings.spin is None:
@@ -219,6 +221,7 @@ def with_axis(made: Calibrated, settings: Settings, watch: Watch = SILENT) -> Ca
         tracked = read_sequence(settings.spin, settings)
     else:
         tracked = track_film(settings.spin, settings, watch)
+    pivot_checks.check_seen(tracked.numbers[tracked.found], tracked.numbers, settings, tracked.name)
     found = spin.calibrate(tracked.frames, tracked.name, made.tip.tip_mm)
     beside = spin.beside(tracked.frames.some(found.used), found.axis, made.tip.tip_mm)
     watch.say(_axis_line(found, beside))

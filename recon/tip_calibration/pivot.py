@@ -29,6 +29,7 @@ from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import Rows
 from recon.estimation.levenberg_marquardt import Rules, descend
 from recon.estimation.parameters import Blocks
+from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ class Pivot:
     @cached_property
     def noise(self) -> Array:
         """Covariance of each residual : (n, 3, 3) mm^2."""
-        return tip_noise(self.frames, self.tip) + self.misfit_mm**2 * np.eye(3)
+        return _tip_noise(self.frames, self.tip) + self.misfit_mm**2 * np.eye(3)
 
     @cached_property
     def whiten(self) -> Array:
@@ -96,7 +97,7 @@ class Pivot:
     @cached_property
     def turns(self) -> Array:
         """Rotations : (n, 3, 3), corrected."""
-        return corrected_turns(self.frames, self.unknowns, self.noise)
+        return _corrected_turns(self.frames, self.unknowns, self.noise)
 
     @cached_property
     def slopes(self) -> Array:
@@ -141,15 +142,15 @@ def calibrate(frames: Frames) -> Pivot:
     """
     unknowns, used = start(frames), np.zeros(len(frames.poses), bool)
     for _ in range(ROUNDS):
-        left, noise = residuals(frames, unknowns), tip_noise(frames, unknowns[TIP])
-        misfit, before = median_misfit(left, noise), used
-        used = squares(left, noise, misfit) < GATE
+        left, noise = residuals(frames, unknowns), _tip_noise(frames, unknowns[TIP])
+        misfit, before = _median_misfit(left, noise), used
+        used = _squares(left, noise, misfit) < GATE
         unknowns = fit(frames.some(used), unknowns, misfit)
         if (used == before).all():
             break
     some = frames.some(used)
     for _ in range(2):
-        misfit = mean_misfit(residuals(some, unknowns), tip_noise(some, unknowns[TIP]), 6, FLOOR_MM)
+        misfit = mean_misfit(residuals(some, unknowns), _tip_noise(some, unknowns[TIP]), 6, FLOOR_MM)
         unknowns = fit(some, unknowns, misfit)
     return Pivot(frames, unknowns, misfit, used)
 
@@ -169,7 +170,7 @@ def fit(frames: Frames, start: Array, misfit_mm: float) -> Array:
     """Likeliest unknowns : (12,) from a start, with a misfit of each frame; Undetermined if the poses don't turn."""
 
     def linearise(unknowns: Array) -> tuple[Rows, float]:
-        noise = tip_noise(frames, unknowns[TIP]) + misfit_mm**2 * np.eye(3)
+        noise = _tip_noise(frames, unknowns[TIP]) + misfit_mm**2 * np.eye(3)
         whiten = whitening(noise)
         by_frame = (whiten @ slopes(frames, unknowns, noise)).reshape(-1, len(UNKNOWNS))
         left = np.append((whiten @ residuals(frames, unknowns)[..., None]).ravel(), unknowns[ALIKE])
@@ -178,30 +179,30 @@ def fit(frames: Frames, start: Array, misfit_mm: float) -> Array:
     return descend(start, linearise, np.add, rules=RULES).estimate
 
 
-def arms(frames: Frames, tip: Array) -> Array:
+def _arms(frames: Frames, tip: Array) -> Array:
     """From the target's origin to the tip : (n, 3) mm, in the world."""
     return frames.poses[:, :3, :3] @ tip
 
 
-def alike(frames: Frames, tip: Array) -> Array:
+def _alike(frames: Frames, tip: Array) -> Array:
     """Slopes : (n, 3, 6) mm of the tip's places by the standard normal numbers of the errors that all poses share."""
-    return rigid.slopes(arms(frames, tip)) @ symmetric_root(frames.shared)
+    return rigid.slopes(_arms(frames, tip)) @ symmetric_root(frames.shared)
 
 
 def residuals(frames: Frames, unknowns: Array) -> Array:
     """Place of the tip less the dimple : (n, 3) mm, in the world, without the errors that all poses share."""
     tip, dimple, numbers = UNKNOWNS.split(unknowns)
-    return arms(frames, tip) + frames.poses[:, :3, 3] - dimple + alike(frames, tip) @ numbers
+    return _arms(frames, tip) + frames.poses[:, :3, 3] - dimple + _alike(frames, tip) @ numbers
 
 
-def tip_noise(frames: Frames, tip: Array) -> Array:
+def _tip_noise(frames: Frames, tip: Array) -> Array:
     """Covariance : (n, 3, 3) mm^2 of the tip's places by the poses' own noise."""
-    return propagate(rigid.slopes(arms(frames, tip)) @ symmetric_root(frames.covariance), np.eye(6))
+    return propagate(rigid.slopes(_arms(frames, tip)) @ symmetric_root(frames.covariance), np.eye(6))
 
 
-def corrected_turns(frames: Frames, unknowns: Array, noise: Array) -> Array:
+def _corrected_turns(frames: Frames, unknowns: Array, noise: Array) -> Array:
     """Rotations : (n, 3, 3) of the poses without their own likeliest errors, by a covariance : (n, 3, 3) mm^2 of residuals."""
-    by_pose = rigid.slopes(arms(frames, unknowns[TIP]))
+    by_pose = rigid.slopes(_arms(frames, unknowns[TIP]))
     normal = np.linalg.solve(noise, residuals(frames, unknowns)[..., None])
     errors = (frames.covariance @ np.swapaxes(by_pose, 1, 2) @ normal)[..., 0]
     return rigid.moved(frames.poses, -errors)[:, :3, :3]
@@ -209,28 +210,28 @@ def corrected_turns(frames: Frames, unknowns: Array, noise: Array) -> Array:
 
 def slopes(frames: Frames, unknowns: Array, noise: Array) -> Array:
     """Of the residuals by the unknowns : (n, 3, 12), by rotations that are corrected."""
-    turns = corrected_turns(frames, unknowns, noise)
+    turns = _corrected_turns(frames, unknowns, noise)
     by_dimple = np.broadcast_to(-np.eye(3), turns.shape)
-    return np.concatenate([turns, by_dimple, alike(frames, unknowns[TIP])], axis=2)
+    return np.concatenate([turns, by_dimple, _alike(frames, unknowns[TIP])], axis=2)
 
 
-def squares(left: Array, noise: Array, misfit: float) -> Array:
+def _squares(left: Array, noise: Array, misfit: float) -> Array:
     """Squares : (n,) of residuals : (n, k) in standard deviations, by a covariance : (n, k, k) and a misfit along each axis."""
     total = noise + misfit**2 * np.eye(left.shape[1])
     return np.einsum("ni,ni->n", left, np.linalg.solve(total, left[..., None])[..., 0])
 
 
-def median_misfit(left: Array, noise: Array) -> float:
+def _median_misfit(left: Array, noise: Array) -> float:
     """The misfit, mm, with which the median of the squares is that of chi-square: outliers hardly count."""
-    return least_misfit(lambda misfit: float(np.median(squares(left, noise, misfit))) < MEDIAN, FLOOR_MM)
+    return _least_misfit(lambda misfit: float(np.median(_squares(left, noise, misfit))) < MEDIAN, FLOOR_MM)
 
 
 def mean_misfit(left: Array, noise: Array, unknowns: int, floor: float) -> float:
     """The misfit with which the mean of the squares is that of chi-square, a number of unknowns taken off."""
-    return least_misfit(lambda misfit: float(squares(left, noise, misfit).sum()) < left.size - unknowns, floor)
+    return _least_misfit(lambda misfit: float(_squares(left, noise, misfit).sum()) < left.size - unknowns, floor)
 
 
-def least_misfit(enough: Callable[[float], bool], floor: float) -> float:
+def _least_misfit(enough: Callable[[float], bool], floor: float) -> float:
     """The least misfit, from a floor on, that is enough, to 1 in 10 000; all beyond it are."""
     low, high = floor, floor
     while not enough(high) and high < MOST_MISFIT:
@@ -239,18 +240,6 @@ def least_misfit(enough: Callable[[float], bool], floor: float) -> float:
         middle = (low + high) / 2
         low, high = (low, middle) if enough(middle) else (middle, high)
     return high
-
-
-def persistence(normalised: Array) -> float:
-    """Sum of the autocorrelation of residuals : (n, 3), of both signs of the delay, until it is lost in noise."""
-    n, total = len(normalised), 1.0
-    power = float((normalised**2).mean())
-    for delay in range(1, n // 3):
-        alike = float((normalised[delay:] * normalised[:-delay]).mean()) / power
-        if alike < 2 / np.sqrt(3 * (n - delay)):
-            break
-        total += 2 * alike
-    return total
 
 
 def symmetric_root(covariances: Array) -> Array:

@@ -85,7 +85,7 @@ def calibrate(
     InputError
         If the film shows too little, or that the tip wasn't at rest.
     """
-    _check_seen(numbers, every, demands, name)
+    check_seen(numbers, every, demands, name)
     try:
         found = pivot.calibrate(frames)
     except Undetermined:
@@ -104,7 +104,8 @@ def calibrate(
     return found, list(_warnings(found, bent, shown, numbers, demands))
 
 
-def _check_seen(numbers: NDArray[np.int64], every: NDArray[np.int64], demands: Demands, name: str) -> None:
+def check_seen(numbers: NDArray[np.int64], every: NDArray[np.int64], demands: Demands, name: str) -> None:
+    """Refuse a film that shows the target too rarely: in frames of some numbers : (n,), out of all : (m,)."""
     seen, count = len(numbers), len(every)
     if seen < demands.least_seen * count:
         edges = np.concatenate([[-1], np.flatnonzero(np.isin(every, numbers)), [count]])
@@ -114,7 +115,7 @@ def _check_seen(numbers: NDArray[np.int64], every: NDArray[np.int64], demands: D
         way = f"film again in view of both cameras, or give least_seen={np.floor(100 * seen / count) / 100:g} if that is enough"
         raise InputError(f"{name}: expected the target in {100 * demands.least_seen:.0f} % of the frames, found {found}; {way}")
     if seen < LEAST_POSES:
-        raise InputError(f"{name}: expected {LEAST_POSES} poses or more of a tool that pivots, better 200, found {seen}")
+        raise InputError(f"{name}: expected {LEAST_POSES} poses or more of a tool that turns, better 200, found {seen}")
 
 
 def turns_deg(poses: Array) -> Array:

@@ -16,12 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
+from recon.estimation.persistence import persistence
 from recon.geometry import rigid
-from recon.tip_calibration.pivot import Frames, mean_misfit, persistence
+from recon.tip_calibration.pivot import Frames, mean_misfit
 
 Array = NDArray[np.float64]
 
-LEAST_POSES = 20
 LEAST_SPAN_DEG = 60.0  # of the turn about the shaft
 MOST_WOBBLE_DEG = 1.0  # standard deviation of the shaft's direction about each of two axes
 MOST_SIGMA_DEG = 0.5
@@ -55,16 +55,12 @@ def calibrate(frames: Frames, name: str, tip: Array | None = None) -> Spin:
     InputError
         If it turns too little, or not about one axis that keeps its direction.
     """
-    if len(frames.poses) < LEAST_POSES:
-        raise InputError(
-            f"{name}: expected {LEAST_POSES} poses or more of a tool that turns about its shaft, found {len(frames.poses)}"
-        )
     used = np.ones(len(frames.poses), bool)
     axis, direction = _mean_axis(frames)
     for _ in range(ROUNDS):
-        axis, direction = _mean_axis(frames.some(used))
         angles = np.linalg.norm(frames.poses[:, :3, :3] @ axis - direction, axis=1)
         used = angles <= OUTLYING * np.median(angles) + FLOOR_RAD
+        axis, direction = _mean_axis(frames.some(used))
     some = frames.some(used)
     span = _span_deg(some, axis)
     if span < LEAST_SPAN_DEG:

@@ -39,6 +39,6 @@ class Config(probe_step.Settings):
 
 
 def run(config: Config) -> None:
-    """Find the crossing in all frames, calibrate, judge and write; raises InputError as `recon.session.probe_step.run`."""
+    """Find the phantom in all frames, calibrate, judge and write; raises InputError as `recon.session.probe_step.run`."""
     step = probe_runs_step if config.runs else probe_step
     step.run(config, config.out, choices.read_rig().probe, ConsoleWatch())

@@ -102,6 +102,23 @@ def test_a_drawing_will_do(tmp_path, capsys):
     assert sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) == ["metrics.json", "tip.yaml"]
 
 
+def test_an_axis_that_points_away_from_the_tip_is_said(tmp_path, capsys):
+    for axis, said in (("[0,0,1]", True), ("[0,0.5,-1]", False)):
+        assert main(["calibrate-tip", "tip_mm=[0,-2.5,-150]", f"axis={axis}", f"out={tmp_path / 'tip'}"]) == 0
+        assert ("expected from the handle to the tip" in capsys.readouterr().out) is said
+
+
+def test_a_second_film_mostly_without_the_target_is_refused(table, tool, tmp_path, capsys):
+    path = spun(tool, tmp_path / "spin.csv")
+    track = sweep_tables.read_track(path)
+    some = track.poses.copy()
+    some[60:] = np.nan
+    sweep_tables.write_track(path, Track(track.times, some, track.covariance, track.shared))
+    assert main(["calibrate-tip", f"track={table}", f"spin={path}", f"out={tmp_path / 'tip'}"]) == 2
+    said = capsys.readouterr().err
+    assert "spin.csv: expected the target in 60 % of the frames, found it in 60 of 150, and in none from 60 to 149" in said
+
+
 def test_a_sequence_will_do(poses, tool, tmp_path):
     """Poses of another tracker, to 0.01 mm and 0.01 deg, with a picture of no use."""
     rng = np.random.default_rng(9)

@@ -1,6 +1,7 @@
 """N-wires, as phantoms of the PLUS toolkit have them: their dots by `wire_dots`, the calibration by `line_calibration`."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +36,7 @@ def read(settings: Settings, reference: str | None) -> PlusPhantom:
     if settings.registration == "known" and phantom.reference_from_phantom is None:
         where = "a sequence, for whose frames wires= has it" if reference is None else f"PhantomTo{reference} in wires="
         raise InputError(f"registration: expected {where}, found none; registration=free needs none")
-    free = settings.registration == "free"
-    return PlusPhantom(phantom.wires, phantom.name, None, phantom.target_from_pixel) if free else phantom
+    return replace(phantom, reference_from_phantom=None) if settings.registration == "free" else phantom
 
 
 def find(image: NDArray, appearance: Appearance | None, known: PlusPhantom) -> Dots:
@@ -87,6 +87,7 @@ def figures(found: LineAdjustment) -> Metrics:
         "registration_off_deg": found.registration_off[0],
         "phantom_size": found.size[0],
         "phantom_size_sigma": found.size[1],
+        "frames_that_count_as_one": found.persistence,
         "more_lag_s": found.more_lag_s[0],
         "more_lag_sigma_s": found.more_lag_s[1],
     }

@@ -175,6 +175,41 @@ def _moved(poses, rates, lag_s):
     return later
 
 
+def slipped(probe, poses, half):
+    """Poses of a target against which the probe moves by a step : (6,) both ways of its middle, after two fifths of them."""
+    growth = np.where(np.arange(len(poses)) < 2 * len(poses) // 5, -1, 1)
+    moved = [rigid.moved(probe.target_from_image, each * half) for each in growth]
+    return np.array([pose @ probe.target_from_image @ rigid.invert(own) for pose, own in zip(poses, moved, strict=True)])
+
+
+def test_a_slip_of_the_bracket_is_told_and_counts(probe, poses, rng):
+    """By 0.6 deg and 0.6 mm: a warning with its size, and the calibration of either end is within its uncertainty."""
+    sightings = wire_rows.observe(probe, FCAL, poses, rng)
+    assert calibrate(sightings).moved is None
+    half = np.array([*np.radians([0.3, 0, 0]), 0, 0.3, 0])
+    found = calibrate(replace(sightings, poses=slipped(probe, sightings.poses, half)))
+    assert found.moved.what == "probe"
+    assert found.moved.growth == pytest.approx(half, abs=0.15), "rad and mm, to some 3 sigma"
+    (said,) = found.doubts()
+    assert "the probe moved against its target by 0." in said and "a bracket that gives or slips" in said
+    for end in (-half, half):
+        other = replace(probe, target_from_image=rigid.moved(probe.target_from_image, end))
+        away = found.calibration.to_target(POINTS[:1]) - other.to_target(POINTS[:1])
+        assert away[0] @ np.linalg.solve(point_calibration.point_covariance(found.calibration, POINTS[:1])[0], away[0]) < 14.2
+
+
+def test_poses_that_err_alike_for_a_while_are_no_slip(probe, rng):
+    """As of a magnetic tracker in a distorted field, by 0.2 mm for five frames each: no movement, but a wider covariance."""
+    poses = wire_rows.poses_over(probe, FCAL, SIZE, rng, count=60)
+    sightings = wire_rows.observe(probe, FCAL, poses, rng)
+    wrong = sightings.poses.copy()
+    wrong[:, :3, 3] += np.repeat(0.2 * rng.standard_normal((12, 3)), 5, axis=0)
+    right, found = calibrate(sightings), calibrate(replace(sightings, poses=wrong))
+    assert found.moved is None
+    sigmas = [each.calibration.uncertainty.sigma("tx") for each in (right, found)]
+    assert sigmas[1] > 1.2 * found.noise_factor / right.noise_factor * sigmas[0]
+
+
 def test_a_registration_of_before_the_phantom_was_moved_is_noticed(probe, poses, rng):
     moved = Registration(rigid.moved(WORLD_FROM_PHANTOM, np.array([0, 0, 0.1, 5.0, -3, 0])), 0.5)
     found = calibrate(wire_rows.observe(probe, FCAL, poses, rng), Wires(FCAL, 0.1, moved))
