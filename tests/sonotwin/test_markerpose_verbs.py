@@ -79,6 +79,7 @@ def test_networks_go_out_with_the_data_set_of_the_rig(film, networks, tmp_path):
 @pytest.mark.parametrize(("fields", "complaint"), [
     ([], "export: data: needs a value with layout=markerpose"),
     (["capture={film}", "lag_s=0.1"], "export: lag_s: expected none with layout=markerpose"),
+    (["networks={networks}", "sweep=scan"], "export: sweep: expected none without capture, found scan"),
     (["data={folder}/none"], "none: expected a folder with shards"),
     (["networks={folder}"], "networks: expected detector.pt in one folder of"),
     (["networks={networks}"], "detector.pt: expected weights conv1.double_conv.0.weight of shape [64, 1, 3, 3], found none; "

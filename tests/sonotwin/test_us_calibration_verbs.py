@@ -1,5 +1,6 @@
 """The layouts of the rig authors' probe calibration and acquisition: out, in again, and refused where files don't fit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from recon.capture.layouts import meza2021
 from recon.capture.manifest import CAMERAS, SCANNER, Device, read_manifest
 from recon.capture.writer import new_capture
 from recon.geometry import rigid
+from recon.model.calibration import Calibration
 from recon.model.tracks import Track
 from sonotwin.cli import main
 from tests.sonotwin.test_meza2021_verbs import contents, noise, optics
@@ -118,11 +120,25 @@ def test_captures_that_are_no_sets_are_refused(tmp_path, capsys):
         ),
         ([f"capture=[{folder},{folder}]"], "expected each folder once"),
         ([f"capture={folder}", "sweep=scan"], "expected the name of one of wires"),
+        ([f"capture={folder}", "frames=false", "apart_s=0.1"], "apart_s: expected none with frames=false"),
     ):
         assert main([*line, *fields]) == 2 and complaint in capsys.readouterr().err
     assert main(["export", f"capture=[{folder},{tmp_path}]", f"out={tmp_path / 'sets'}"]) == 2
     assert "expected one with layout=meza2021, found 2" in capsys.readouterr().err
     assert not (tmp_path / "sets").exists()
+
+
+def test_sets_of_other_cameras_do_not_go_out_with_one_file(tmp_path, capsys):
+    """By the file of the first capture their script would triangulate the second one's frames elsewhere."""
+    made = [wires(tmp_path / f"wires{seed}", seed)[0] for seed in (1, 5)]
+    moved = optics()
+    aside = rigid.from_rotation_vector([0, 0, 0], [1.0, 0, 0])  # mm
+    second = replace(moved.cameras["cam2"], camera_from_world=aside @ moved.cameras["cam2"].camera_from_world)
+    calibration_files.write(made[1] / "calibration/optics.yaml", Calibration({**moved.cameras, "cam2": second}))
+    line = ["export", "layout=us_calibration", f"capture=[{made[0]},{made[1]}]", "implausible=take", f"out={tmp_path / 'sets'}"]
+    assert main(line) == 2 and not (tmp_path / "sets").exists()
+    assert f"{made[1]}: expected the cameras' calibration of {made[0]}" in capsys.readouterr().err
+    assert main([*line, f"calibration={made[0] / 'calibration/optics.yaml'}"]) == 0
 
 
 def resize(folder: Path) -> None:
