@@ -157,6 +157,9 @@ OPTICS_ALONE = '''"""A folder with a file of cameras."""
 from recon.capture import calibration_files
 
 
+TAKES = ("camera_hz",)
+
+
 def read_capture(folder, known):
     """Read the cameras."""
     optics = calibration_files.read(folder / "cameras.yaml")

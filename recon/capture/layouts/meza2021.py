@@ -32,6 +32,7 @@ from recon.model.probe import ProbeCalibration, Speed
 from recon.model.rig import Part
 from recon.model.tracks import Track
 
+TAKES = ("camera_hz", "purpose", "projector_size", "speed_m_s")
 STEPS = 8
 PITCH = 12.0  # projector px
 PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
