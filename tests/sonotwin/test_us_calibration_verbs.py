@@ -146,6 +146,11 @@ def resize(folder: Path) -> None:
         cv2.imwrite(str(path), np.zeros((30, 40), np.uint8))
 
 
+def draw_box(folder: Path) -> None:
+    path = str(folder / "data2/L/left2.png")
+    cv2.imwrite(path, cv2.rectangle(cv2.imread(path, cv2.IMREAD_COLOR), (5, 5), (20, 20), (0, 255, 0), 3))
+
+
 @pytest.mark.parametrize(("spoil", "complaint"), [
     (lambda folder: (folder / "data2/R/right3.png").unlink(), "data2/R: expected 7 frames, as in L/, found 6"),
     (lambda folder: (folder / "data2/L/left3.png").rename(folder / "data2/L/left9.png"),
@@ -153,6 +158,7 @@ def resize(folder: Path) -> None:
     (lambda folder: np.save(folder / "data1/cross_point.npy", np.ones((5, 2))),
      "cross_point.npy: expected 7 frames, as in L/, found 5"),
     (lambda folder: [path.unlink() for path in (folder / "data1/UScrop").iterdir()], "data1: expected B-scans in UScrop/ or US/"),
+    (draw_box, "left2.png: expected grey, found colour: boxes of the live detection"),
     (resize, "UScrop: expected images of 120x100 px, as in data1, found 40x30"),
     (lambda folder: (folder / "data1/UScrop/US4.png").write_bytes(b"none"), "US4.png: expected an image"),
     (lambda folder: (folder / "cam1_cam2.npz").write_bytes(b"PK"), "cam1_cam2.npz: expected"),
@@ -208,6 +214,19 @@ def test_boxes_of_the_live_detection_are_refused(recording, tmp_path, capsys):
     assert main(line) == 0
     cv2.imwrite(str(path), cv2.rectangle(image, (5, 5), (20, 20), (0, 255, 0), 3))
     assert main(line) == 2 and "left4.bmp: expected grey, found colour: boxes" in capsys.readouterr().err
+
+
+def test_frames_that_begin_with_other_numbers_are_told(recording, tmp_path, capsys, caplog):
+    """Without left0 and right10 every pair is of two moments; what the layout has no place for is refused."""
+    (recording / "L" / "left0.bmp").unlink()
+    for name in ("R/right10.bmp", "US/US10.bmp", "UScrop/US10.bmp"):
+        (recording / name).unlink()
+    line = ["import", "layout=stereo_basler", f"folder={recording}", f"out={tmp_path / 'capture'}"]
+    assert main(line) == 0
+    said = [record.getMessage() for record in caplog.records if "begins with right0.bmp" in record.getMessage()]
+    assert len(said) == 1 and "belong to L/left1.bmp: are the first ones lost?" in said[0]
+    assert main([*line, "speed_m_s=1488"]) == 2
+    assert "import: speed_m_s: expected none with layout=stereo_basler" in capsys.readouterr().err
 
 
 def test_a_recording_and_sets_name_each_other(recording, tmp_path, capsys):
