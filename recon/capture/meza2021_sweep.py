@@ -177,7 +177,7 @@ def read_rows(path: Path, shape: tuple[int, ...]) -> Array | None:
     if rows.ndim != 1 + len(shape) or rows.shape[1:] != shape or rows.dtype.kind not in "fiu":
         expected = f"numbers of shape (n, {', '.join(map(str, shape))})"
         raise InputError(f"{path}: expected {expected}, found {rows.dtype} of shape {rows.shape}")
-    finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
+    finite = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
     if not finite.all():
         raise InputError(f"{path}: frame {int(np.argmin(finite))}: expected finite numbers, found some that aren't")
     return rows.astype(float)
