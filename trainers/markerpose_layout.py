@@ -34,7 +34,12 @@ AT_ONCE = 256  # images that are in memory
 
 def recognises(folder: Path) -> bool:
     """Whether a folder has their table or their patches."""
-    return (folder / TABLE).exists() or (folder / PATCHES).is_dir()
+    return (folder / TABLE).exists() or has_patches(folder)
+
+
+def has_patches(folder: Path) -> bool:
+    """Whether a folder has their patches."""
+    return (folder / PATCHES).is_dir()
 
 
 def read_views(folder: Path) -> Views:

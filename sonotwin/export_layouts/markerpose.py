@@ -1,6 +1,6 @@
 """MarkerPose's folders: a data set's views and patches for its training, a film's frames for its example, and networks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +10,7 @@ from recon.capture.manifest import CAMERAS
 from recon.errors import InputError
 from recon.model.calibration import Calibration
 from sonotwin.export_layouts import Settings
-from trainers import data_sets, markerpose_layout, shard_reader
+from trainers import data_sets, markerpose_layout
 
 TAKES = ("capture", "calibration", "sweep", "data", "networks")
 ABOUT = "of frames and networks alone"
@@ -37,7 +37,7 @@ def write(folder: Path, settings: Settings) -> list[str]:
     if settings.data:
         views = data_sets.read_views(settings.data)
         lines.append(f"views       {markerpose_layout.write_views(folder, views)} of {len(views)}, those with all circles")
-        lines.append(_write_patches(folder, settings))
+        lines += _write_patches(folder, settings.data)
     if settings.capture:
         film = stereo_frames.read_film(settings.source, settings.calibration, settings.sweep)
         optics = Calibration(dict(zip(CAMERAS, film.cameras, strict=True)))
@@ -50,9 +50,11 @@ def write(folder: Path, settings: Settings) -> list[str]:
     return lines
 
 
-def _write_patches(folder: Path, settings: Settings) -> str:
-    """Write the patches of data sets that have them; returns a line about them."""
-    if not shard_reader.has_patches(settings.data):
-        return "left out    patches: the data set has none, which frames=views writes"
-    patches = data_sets.read_patches(settings.data)
-    return f"patches     {markerpose_layout.write_patches(folder, patches)} of {len(patches)}, those with a disc"
+def _write_patches(folder: Path, data: Sequence[Path]) -> list[str]:
+    """Write the patches of those data sets that have them; returns lines about them, and about those that have none."""
+    sources, lines = data_sets.with_patches(data), []
+    if sources:
+        patches = data_sets.read_patches(sources)
+        lines.append(f"patches     {markerpose_layout.write_patches(folder, patches)} of {len(patches)}, those with a disc")
+    without = ", ".join(str(source) for source in data if source not in sources)
+    return [*lines, f"left out    patches: {without} has none, which frames=views writes"] if without else lines

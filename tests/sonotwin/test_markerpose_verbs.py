@@ -1,7 +1,9 @@
 """MarkerPose's layouts by the commands: training data out, frames of its example out and in, networks by the scripts' names."""
 # ruff: noqa: E402 - torch is asked for before what needs it
 
+import io
 import shutil
+import tarfile
 
 import numpy as np
 import pytest
@@ -66,6 +68,23 @@ def test_a_data_set_goes_out_for_their_training_and_trains_here(tmp_path, capsys
     (theirs / "images" / "im3.png").unlink()
     assert main([*line, f"out={tmp_path / 'other'}"]) == 2 and not (tmp_path / "other").exists()
     assert "im3.png: expected a file, found none" in capsys.readouterr().err
+
+
+def test_patches_go_out_of_those_sets_that_have_them(tmp_path, capsys):
+    """Full frames have none, beside views that have."""
+    write_set(tmp_path / "data", 6)
+    write_set(tmp_path / "bare", 6, seed=1)
+    shard = tmp_path / "bare" / "shard-00000.tar"
+    with tarfile.open(shard) as archive:
+        kept = [(entry, archive.extractfile(entry).read()) for entry in archive if "patches" not in entry.name]
+    with tarfile.open(shard, "w") as archive:
+        for entry, content in kept:
+            archive.addfile(entry, io.BytesIO(content))
+    line = ["export", "layout=markerpose", f"data=[{tmp_path / 'bare'},{tmp_path / 'data'}]", f"out={tmp_path / 'theirs'}"]
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    assert "of 36, those with a disc" in said and f"left out    patches: {tmp_path / 'bare'} has none" in said
+    assert "of 24, those with all circles" in said
 
 
 def test_networks_go_out_with_the_data_set_of_the_rig(film, networks, tmp_path):
