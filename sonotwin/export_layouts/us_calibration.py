@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.capture import calibration_files
+from recon.capture.images import Size
 from recon.capture.layouts import meza2021, us_calibration
 from recon.errors import InputError
 from recon.model.calibration import Calibration
@@ -27,13 +28,13 @@ def write(folder: Path, settings: Settings) -> list[str]:
     if not settings.capture:
         raise InputError("export: capture: needs a value; give capture=...")
     optics, lines = _cameras(settings), []
-    size = None
+    sizes: list[Size] = []
     for number, capture in enumerate(settings.capture, 1):
         selected, about = exported_scans.read(settings, capture, "probe")
         sweep = selected.sweep
-        size = size or sweep.size
-        if sweep.size != size:
-            expected, found = ("x".join(map(str, each)) for each in (size, sweep.size))
+        sizes.append(sweep.size)
+        if sweep.size != sizes[0]:
+            expected, found = ("x".join(map(str, each)) for each in (sizes[0], sweep.size))
             raise InputError(f"{capture}: expected B-scans of {expected} px, as of {settings.capture[0]}, found {found}")
         frames = probe_step.look(sweep, lag_s=settings.lag_s)
         crossed = np.isin(selected.scans, frames.usable)
@@ -43,7 +44,7 @@ def write(folder: Path, settings: Settings) -> list[str]:
             crossings = np.array([frames.seen[k].pixel for k in selected.scans.tolist()])
         name = us_calibration.write_set(folder, number, selected.images(), selected.poses, crossings)
         lines += [f"{name:11} {about[0]}; {said}", *about[1:]]
-    return [*lines, f"beside      {', '.join(us_calibration.write_settings(folder, size, optics))}"]
+    return [*lines, f"beside      {', '.join(us_calibration.write_settings(folder, sizes[0], optics))}"]
 
 
 def _cameras(settings: Settings) -> Calibration | None:
