@@ -73,7 +73,8 @@ def cases(place: Path, commands: Sequence[Command] = COMMANDS) -> list[Case]:
 
 def _of_fields(command: Command) -> Iterator[Case]:
     named = [field.partition("=") for field in command.fields]
-    inputs = [name for name, _, value in named if value.split("/")[0] in command.folders]
+    firsts = ((name, value.strip("[]").split(",")[0].split("/")[0]) for name, _, value in named)  # of a list, too
+    inputs = [name for name, first in firsts if first in command.folders]
     for override in field_faults.overrides(command.verb, command.line[1:], inputs):
         yield Case(command, override, (override,))
 

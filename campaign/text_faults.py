@@ -136,6 +136,7 @@ def xml_faults(content: bytes) -> Iterator[tuple[str, bytes]]:
     )
     stolen = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><PlusConfiguration>&a;</PlusConfiguration>'
     yield "a file from elsewhere", stolen.encode()
-    for value in (b"many", b"nan nan nan", b"-1 -1 -1", b"1e-9 1e-9 1e-9", DIGITS.encode()):
-        yield f"a spacing of {value[:20].decode()}", content.replace(b"0.5 0.5 0.5", value)
+    spacing = b"0.5 0.5 0.5"
+    for value in (b"many", b"nan nan nan", b"-1 -1 -1", b"1e-9 1e-9 1e-9", DIGITS.encode()) if spacing in content else ():
+        yield f"a spacing of {value[:20].decode()}", content.replace(spacing, value)
     yield "nested 100 000 deep", b"<PlusConfiguration>" + b"<a>" * 100_000

@@ -1,5 +1,6 @@
 """Fields of several folders: one may be given by itself, and none twice."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +13,9 @@ def listed(value: object) -> object:
 
 
 def _each_once(folders: list[Path]) -> list[Path]:
-    for place, folder in enumerate(folders):
-        if folder.resolve() in (other.resolve() for other in folders[:place]):
+    real = [os.path.realpath(folder) for folder in folders]  # of a link to itself, too, which Path.resolve doesn't take
+    for folder, place in zip(folders, real, strict=True):
+        if real.count(place) > 1:
             raise ValueError(f"expected each folder once, found {folder} twice")
     return folders
 

@@ -35,6 +35,13 @@ def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, parti
     return joined([*parts, *(markerpose_layout.read_patches(folder) for folder in others)])
 
 
+def with_patches(folders: Sequence[Path]) -> list[Path]:
+    """Those of some folders that have patches: MarkerPose's, or shards whose first sample has them."""
+    shards, others = _kinds(folders)
+    have = [*filter(shard_reader.has_patches, shards), *filter(markerpose_layout.has_patches, others)]
+    return [folder for folder in folders if folder in have]
+
+
 def joined(parts: Sequence[Some]) -> Some:
     """Samples of all parts, one after the other; their images may lie in files of any kind."""
     first, *others = parts

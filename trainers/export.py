@@ -4,10 +4,10 @@ import io
 import struct
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import onnxruntime
@@ -69,20 +69,34 @@ def load(path: Path, network: nn.Module) -> None:
     network.load_state_dict(weights)
 
 
-def copy_published(source: Path, path: Path, name: Name) -> None:
-    """Write weights of a published network, of three circles, as .pt again, after a check.
+def copy_published(
+    sources: Sequence[Path], folder: Path, names: Mapping[Literal["published_detector", "published_segmenter"], str]
+) -> str:
+    """Write published networks, of three circles, under the names that other programs load; returns a line about them.
+
+    Parameters
+    ----------
+    sources : folders, in one of which detector.pt lies, and in one segmenter.pt
+    names : network -> file
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, or of another network, with the way to such a one.
+        If a file is in none of the folders or in several, damaged, or of another network, with the way to such a one.
     """
-    module = architectures.network(name, circles=3)
-    try:
-        load(source, module)
-    except InputError as error:
-        raise InputError(f"{error}; sonotwin train network={name} makes the published shape") from None
-    save(path, module)
+    for network, name in names.items():
+        file = f"{network.removeprefix('published_')}.pt"
+        there = [path for source in sources if (path := source / file).exists()]
+        if len(there) != 1:
+            places = ", ".join(map(str, sources))
+            raise InputError(f"networks: expected {file} in one folder of {places}, found it in {len(there)}")
+        module = architectures.network(network, circles=3)
+        try:
+            load(there[0], module)
+        except InputError as error:
+            raise InputError(f"{error}; sonotwin train network={network} makes the published shape") from None
+        save(folder / name, module)
+    return f"networks    {', '.join(names.values())}"
 
 
 def check_tensors(path: Path, kind: str, found: object, expected: Mapping[Any, Tensor]) -> None:

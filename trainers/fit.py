@@ -12,7 +12,6 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from lightning_fabric import Fabric
 from pydantic import ConfigDict, Field, RootModel
 from torch import Tensor, nn
 
@@ -83,6 +82,8 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
     KeyboardInterrupt
         On Ctrl-C, or whatever the handlers of SIGTERM and SIGHUP raise, once the checkpoint is written.
     """
+    from lightning_fabric import Fabric  # takes seconds to import
+
     for name in ("lightning_utilities.core.rank_zero", "lightning_fabric.utilities.rank_zero"):
         logging.getLogger(name).setLevel(logging.WARNING)  # it would say which precision it takes
     fabric = Fabric(accelerator="auto", devices=1, precision=precision_of(plan.precision))

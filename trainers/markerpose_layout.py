@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon.capture.image_formats import decode_image, luma, size_of
 from recon.capture.images import image_files, write_images
+from recon.capture.meza2021_sweep import check_numbers
 from recon.errors import InputError, brief, short
 from recon.files import atomic
 from recon.files.regular import MOST_TABLE, check_there, opened, read_bytes
@@ -33,7 +34,12 @@ AT_ONCE = 256  # images that are in memory
 
 def recognises(folder: Path) -> bool:
     """Whether a folder has their table or their patches."""
-    return (folder / TABLE).exists() or (folder / PATCHES).is_dir()
+    return (folder / TABLE).exists() or has_patches(folder)
+
+
+def has_patches(folder: Path) -> bool:
+    """Whether a folder has their patches."""
+    return (folder / PATCHES).is_dir()
 
 
 def read_views(folder: Path) -> Views:
@@ -68,13 +74,15 @@ def read_patches(folder: Path) -> Patches:
     Raises
     ------
     InputError
-        If there are none, patches and masks are of different numbers, or one is damaged or of another size.
+        If there are none, patches and masks are of different numbers or numbered differently, or one is damaged or of another
+        size.
     """
     patches, masks = (image_files(folder / name) for name in (PATCHES, MASKS))
     if not patches or len(patches) != len(masks):
         found = f"{len(patches)} and {len(masks)}"
         raise InputError(f"{folder}: expected as many images in {PATCHES}/ as in {MASKS}/, one or more, found {found}")
     patches, masks = (sorted(paths, key=str) for paths in (patches, masks))  # as their script pairs them
+    check_numbers(folder, {PATCHES: patches, MASKS: masks})
     size = (PATCH, PATCH)
     list(mapped(_check_size, patches, [size] * len(patches)))
     n, stored = len(patches), _stored(masks, size)

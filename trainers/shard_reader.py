@@ -131,11 +131,10 @@ def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, parti
     return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (circles * len(VIEWS)))
 
 
-def has_patches(folders: Sequence[Path]) -> bool:
-    """Whether the first sample of each data set has patches, or the folder no shards."""
-    firsts = (next(iter(sorted(folder.glob("*.tar"))), None) for folder in folders)
-    samples = [next(tar_members.samples(path), ("", {}))[1] for path in firsts if path is not None]
-    return all("patches1.png" in members for members in samples)
+def has_patches(folder: Path) -> bool:
+    """Whether the first sample of a data set has patches."""
+    samples = (sample for path in sorted(folder.glob("*.tar")) for _, sample in tar_members.samples(path))
+    return "patches1.png" in next(samples, {})
 
 
 def split(data: Some, validation: float) -> tuple[Some, Some]:

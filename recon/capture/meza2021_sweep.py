@@ -81,22 +81,29 @@ def read_sweep(place: Path, scanner: Sequence[str] = (FOLDERS["us"],)) -> Author
     for name, found in counts.items():
         if found != count:
             raise InputError(f"{place / name}: expected {count} frames, as in {first}/, found {found}")
-    _check_numbers(place, {folders[device]: paths for device, paths in images.items()})
+    check_numbers(place, {folders[device]: paths for device, paths in images.items()})
     sizes = {device: read_grey(paths[0]).shape[::-1] for device, paths in images.items()}
     return AuthorsSweep(folders, images, sizes, masks, None if poses is None else _rigid(place / POSES, poses), crossings)
 
 
-def _check_numbers(place: Path, folders: Mapping[str, Sequence[Path]]) -> None:
-    """Refuse folders with equally many images that lack different ones, by the last number in the files' names."""
+def check_numbers(place: Path, folders: Mapping[str, Sequence[Path]]) -> None:
+    """Refuse folders with equally many images that lack different ones, by the last number in the files' names.
+
+    Warns of folders whose first numbers differ: counted from elsewhere, or without the first ones.
+    """
     found = {name: [re.findall(r"\d+", path.stem) for path in paths] for name, paths in folders.items()}
     if not all(each for numbers in found.values() for each in numbers):
         return
-    first, *others = {name: [int(each[-1]) - int(numbers[0][-1]) for each in numbers] for name, numbers in found.items()}.items()
-    for name, numbers in others:
-        if k := next((k for k, (one, other) in enumerate(zip(first[1], numbers, strict=True)) if one != other), 0):
-            one, other = folders[first[0]][k].name, folders[name][k].name
-            raise InputError(
-                f"{place / name}: expected the frame of {first[0]}/{one} next, found {other}: is one lost in between?"
+    (first, numbers), *others = ((name, [int(each[-1]) for each in numbers]) for name, numbers in found.items())
+    for name, those in others:
+        steps = [(one - numbers[0], other - those[0]) for one, other in zip(numbers, those, strict=True)]
+        if k := next((k for k, (one, other) in enumerate(steps) if one != other), 0):
+            one, other = folders[first][k].name, folders[name][k].name
+            raise InputError(f"{place / name}: expected the frame of {first}/{one} next, found {other}: is one lost in between?")
+        if numbers[0] != those[0]:
+            one, other = folders[first][0].name, folders[name][0].name
+            log.warning(
+                "%s: begins with %s, and is taken to belong to %s/%s: are the first ones lost?", place / name, other, first, one
             )
 
 
@@ -170,7 +177,7 @@ def read_rows(path: Path, shape: tuple[int, ...]) -> Array | None:
     if rows.ndim != 1 + len(shape) or rows.shape[1:] != shape or rows.dtype.kind not in "fiu":
         expected = f"numbers of shape (n, {', '.join(map(str, shape))})"
         raise InputError(f"{path}: expected {expected}, found {rows.dtype} of shape {rows.shape}")
-    finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
+    finite = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
     if not finite.all():
         raise InputError(f"{path}: frame {int(np.argmin(finite))}: expected finite numbers, found some that aren't")
     return rows.astype(float)

@@ -1,5 +1,6 @@
 """Several calibrations of one probe: their repeatability, their mean, and each crossing by the calibration of the others."""
 
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,7 +112,7 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
     if len(sources) < 2:
         expected = f"runs: expected two or more of one probe, found {len(sources)}"
         raise InputError(f"{expected}: a capture counts once for each sweep with purpose probe; one calibrates by capture=")
-    places = [(path.resolve(), sweep) for path, sweep in sources]
+    places = [(os.path.realpath(path), sweep) for path, sweep in sources]
     if len(set(places)) < len(places):
         twice = next(sources[k] for k, place in enumerate(places) if place in places[:k])
         raise InputError(f"runs: expected each once, found {name_of(*twice)} twice: its repeatability would be 0")

@@ -1,5 +1,6 @@
 """Settings that several steps share: each with its default, its bounds, its unit and its text, once."""
 
+import os
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -62,7 +63,7 @@ class BarFields(Part):
         if bool(self.bars) != (self.bar_mm is not None):
             lacking, given = ("bar_mm", "bars") if self.bars else ("bars", "bar_mm")
             raise ValueError(f"{lacking}: expected beside {given}, found nothing")
-        if len({path.resolve() for path in self.bars}) < len(self.bars):
+        if len({os.path.realpath(path) for path in self.bars}) < len(self.bars):
             raise ValueError("bars: expected each capture once, found one twice")
         _check_sigma("bar_mm", self.bar_mm)
         return self

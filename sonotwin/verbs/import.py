@@ -25,6 +25,7 @@ from recon import registry
 from recon.capture.layouts import Known, meza2021
 from recon.capture.manifest import Purpose
 from recon.capture.writer import new_capture
+from recon.errors import InputError
 from recon.files import atomic
 from recon.model.probe import Speed
 from recon.model.rig import Part, Positive
@@ -63,12 +64,19 @@ def run(config: Config) -> None:
     Raises
     ------
     InputError
-        If nothing of the layout is there, a file is damaged, parts don't fit together, or `out` can't be written to.
+        If nothing of the layout is there, a field is given that it has no place for, a file is damaged, parts don't fit together,
+        or `out` can't be written to.
     """
     console = LineConsole()
     atomic.check_folder(config.out, "import", inputs=[config.folder])
+    kind = registry.kind(LAYOUTS, config.layout)
     known = Known(config.camera_hz, config.purpose, config.projector_size, config.speed_m_s)
-    fill = registry.kind(LAYOUTS, config.layout).read_capture(config.folder, known)
+    for name, value in vars(known).items():
+        if name not in kind.TAKES and value != Config.model_fields[name].default:
+            raise InputError(
+                f"import: {name}: expected none with layout={config.layout}, which has no place for it, found {value}"
+            )
+    fill = kind.read_capture(config.folder, known)
     with console.status("writing"), new_capture(config.out, config.folder.resolve().name, by="import") as capture:
         lines = fill(capture)
     for line in lines:

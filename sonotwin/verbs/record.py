@@ -18,6 +18,7 @@ that begins with `defaults: [basler]`: devices=ours.yaml.
     sonotwin record part=sweep name=wires purpose=probe shots=true scene=crosswire path=wire out=outputs/session
 """
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -184,7 +185,7 @@ class Config(NetworkFields):
 def run(config: Config) -> None:
     """Record, and say what was kept."""
     console = LineConsole()
-    with open_recording(config.out, config.out.resolve().name) as recording:
+    with open_recording(config.out, Path(os.path.realpath(config.out)).name) as recording:
         check_place(config, recording)
         with shown(config, console) as (say, show):
             record = sweep if config.part == "sweep" else still

@@ -76,8 +76,8 @@ class Config(BaseModel):
     precision: Precision = "auto"
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     loaders: Annotated[int, Field(ge=0, le=1024)] = 0
-    memory_gb: Annotated[float, Field(ge=0)] | None = None
-    checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
+    memory_gb: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    checkpoint_minutes: Annotated[float, Field(gt=0, le=100_000)] = 5.0
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
     @model_validator(mode="after")

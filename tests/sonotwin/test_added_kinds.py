@@ -157,6 +157,9 @@ OPTICS_ALONE = '''"""A folder with a file of cameras."""
 from recon.capture import calibration_files
 
 
+TAKES = ("camera_hz",)
+
+
 def read_capture(folder, known):
     """Read the cameras."""
     optics = calibration_files.read(folder / "cameras.yaml")
@@ -178,3 +181,30 @@ def test_another_layout_of_captures_is_one_module(monkeypatch, tmp_path, rig, ca
     assert "optics      cam1, cam2, 25 frames a second" in capsys.readouterr().out
     held = calibration_files.of_capture(tmp_path / "capture", None)
     assert np.array_equal(held.cameras["cam2"].matrix, rig.cam2.optics.camera().matrix)
+
+
+POINTS_ALONE = '''"""The optical centres of all cameras, as text."""
+
+TAKES = ("calibration",)
+ABOUT = "of centres alone"
+
+
+def write(folder, settings):
+    """Write them."""
+    from recon.capture import calibration_files
+
+    cameras = calibration_files.read(settings.calibration).cameras
+    (folder / "centres.txt").write_text(" ".join(cameras))
+    return [f"centres     {len(cameras)}"]
+'''
+
+
+def test_another_layout_to_export_is_one_module(monkeypatch, tmp_path, rig, capsys):
+    """It takes the fields that it names, and others are refused."""
+    added.add(monkeypatch, tmp_path / "ours", "sonotwin.export_layouts", "centres", POINTS_ALONE)
+    calibration_files.write(tmp_path / "cameras.yaml", films.optics(rig))
+    fields = ["layout=centres", f"calibration={tmp_path / 'cameras.yaml'}", f"out={tmp_path / 'out'}"]
+    assert main(["export", *fields]) == 0
+    assert "centres     2" in capsys.readouterr().out and (tmp_path / "out" / "centres.txt").read_text() == "cam1 cam2"
+    assert main(["export", *fields, "implausible=take"]) == 2
+    assert "export: implausible: expected none with layout=centres, which is of centres alone" in capsys.readouterr().err

@@ -1,7 +1,9 @@
 """MarkerPose's layouts by the commands: training data out, frames of its example out and in, networks by the scripts' names."""
 # ruff: noqa: E402 - torch is asked for before what needs it
 
+import io
 import shutil
+import tarfile
 
 import numpy as np
 import pytest
@@ -68,6 +70,23 @@ def test_a_data_set_goes_out_for_their_training_and_trains_here(tmp_path, capsys
     assert "im3.png: expected a file, found none" in capsys.readouterr().err
 
 
+def test_patches_go_out_of_those_sets_that_have_them(tmp_path, capsys):
+    """Full frames have none, beside views that have."""
+    write_set(tmp_path / "data", 6)
+    write_set(tmp_path / "bare", 6, seed=1)
+    shard = tmp_path / "bare" / "shard-00000.tar"
+    with tarfile.open(shard) as archive:
+        kept = [(entry, archive.extractfile(entry).read()) for entry in archive if "patches" not in entry.name]
+    with tarfile.open(shard, "w") as archive:
+        for entry, content in kept:
+            archive.addfile(entry, io.BytesIO(content))
+    line = ["export", "layout=markerpose", f"data=[{tmp_path / 'bare'},{tmp_path / 'data'}]", f"out={tmp_path / 'theirs'}"]
+    assert main(line) == 0
+    said = capsys.readouterr().out
+    assert "of 36, those with a disc" in said and f"left out    patches: {tmp_path / 'bare'} has none" in said
+    assert "of 24, those with all circles" in said
+
+
 def test_networks_go_out_with_the_data_set_of_the_rig(film, networks, tmp_path):
     """By the names that ProbePose.py loads."""
     with new_capture(tmp_path / "capture", "rig") as made:
@@ -79,6 +98,7 @@ def test_networks_go_out_with_the_data_set_of_the_rig(film, networks, tmp_path):
 @pytest.mark.parametrize(("fields", "complaint"), [
     ([], "export: data: needs a value with layout=markerpose"),
     (["capture={film}", "lag_s=0.1"], "export: lag_s: expected none with layout=markerpose"),
+    (["networks={networks}", "sweep=scan"], "export: sweep: expected none without capture, found scan"),
     (["data={folder}/none"], "none: expected a folder with shards"),
     (["networks={folder}"], "networks: expected detector.pt in one folder of"),
     (["networks={networks}"], "detector.pt: expected weights conv1.double_conv.0.weight of shape [64, 1, 3, 3], found none; "

@@ -184,6 +184,7 @@ def save(name: str, rows):
     (lambda folder: (folder / "USdata" / "US" / "im2.png").write_bytes(b"none"), "im2.png: expected an image"),
     (lambda folder: (folder / "cam1_cam2_params.npz").write_bytes(b"PK"), "cam1_cam2_params.npz: expected"),
     (save("target_pose.npy", np.ones((12, 4, 4))), "target_pose.npy: frame 0: expected a rigid"),
+    (save("target_pose.npy", np.ones((0, 4, 4))), "target_pose.npy: expected 12 frames, as in L/, found 0"),
     (save("target_pose.npy", np.array([{}])), "target_pose.npy: expected an array of numbers"),
     (save("cross_point.npy", np.ones((12, 3))), "expected numbers of shape (n, 2), found float64 of shape (12, 3)"),
 ])  # fmt: skip

@@ -123,6 +123,12 @@ def test_other_files_are_left_alone(tmp_path, capsys):
     assert "found other files" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
+def test_a_link_to_itself_is_refused(tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    assert cli.main(["record", "part=surface", f"out={tmp_path / 'loop'}", "preview.serve=false"]) == 2
+    assert "expected a folder or nothing, found a loop of links" in capsys.readouterr().err
+
+
 CAMERA, PROJECTOR = Device(size=(32, 24), exposure_s=0.01, gain=1.0), Device(size=(1280, 800))
 
 

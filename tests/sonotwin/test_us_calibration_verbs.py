@@ -1,5 +1,6 @@
 """The layouts of the rig authors' probe calibration and acquisition: out, in again, and refused where files don't fit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from recon.capture.layouts import meza2021
 from recon.capture.manifest import CAMERAS, SCANNER, Device, read_manifest
 from recon.capture.writer import new_capture
 from recon.geometry import rigid
+from recon.model.calibration import Calibration
 from recon.model.tracks import Track
 from sonotwin.cli import main
 from tests.sonotwin.test_meza2021_verbs import contents, noise, optics
@@ -118,6 +120,7 @@ def test_captures_that_are_no_sets_are_refused(tmp_path, capsys):
         ),
         ([f"capture=[{folder},{folder}]"], "expected each folder once"),
         ([f"capture={folder}", "sweep=scan"], "expected the name of one of wires"),
+        ([f"capture={folder}", "frames=false", "apart_s=0.1"], "apart_s: expected none with frames=false"),
     ):
         assert main([*line, *fields]) == 2 and complaint in capsys.readouterr().err
     assert main(["export", f"capture=[{folder},{tmp_path}]", f"out={tmp_path / 'sets'}"]) == 2
@@ -125,9 +128,27 @@ def test_captures_that_are_no_sets_are_refused(tmp_path, capsys):
     assert not (tmp_path / "sets").exists()
 
 
+def test_sets_of_other_cameras_do_not_go_out_with_one_file(tmp_path, capsys):
+    """By the file of the first capture their script would triangulate the second one's frames elsewhere."""
+    made = [wires(tmp_path / f"wires{seed}", seed)[0] for seed in (1, 5)]
+    moved = optics()
+    aside = rigid.from_rotation_vector([0, 0, 0], [1.0, 0, 0])  # mm
+    second = replace(moved.cameras["cam2"], camera_from_world=aside @ moved.cameras["cam2"].camera_from_world)
+    calibration_files.write(made[1] / "calibration/optics.yaml", Calibration({**moved.cameras, "cam2": second}))
+    line = ["export", "layout=us_calibration", f"capture=[{made[0]},{made[1]}]", "implausible=take", f"out={tmp_path / 'sets'}"]
+    assert main(line) == 2 and not (tmp_path / "sets").exists()
+    assert f"{made[1]}: expected the cameras' calibration of {made[0]}" in capsys.readouterr().err
+    assert main([*line, f"calibration={made[0] / 'calibration/optics.yaml'}"]) == 0
+
+
 def resize(folder: Path) -> None:
     for path in (folder / "data2" / "UScrop").iterdir():
         cv2.imwrite(str(path), np.zeros((30, 40), np.uint8))
+
+
+def draw_box(folder: Path) -> None:
+    path = str(folder / "data2/L/left2.png")
+    cv2.imwrite(path, cv2.rectangle(cv2.imread(path, cv2.IMREAD_COLOR), (5, 5), (20, 20), (0, 255, 0), 3))
 
 
 @pytest.mark.parametrize(("spoil", "complaint"), [
@@ -137,6 +158,7 @@ def resize(folder: Path) -> None:
     (lambda folder: np.save(folder / "data1/cross_point.npy", np.ones((5, 2))),
      "cross_point.npy: expected 7 frames, as in L/, found 5"),
     (lambda folder: [path.unlink() for path in (folder / "data1/UScrop").iterdir()], "data1: expected B-scans in UScrop/ or US/"),
+    (draw_box, "left2.png: expected grey, found colour: boxes of the live detection"),
     (resize, "UScrop: expected images of 120x100 px, as in data1, found 40x30"),
     (lambda folder: (folder / "data1/UScrop/US4.png").write_bytes(b"none"), "US4.png: expected an image"),
     (lambda folder: (folder / "cam1_cam2.npz").write_bytes(b"PK"), "cam1_cam2.npz: expected"),
@@ -192,6 +214,19 @@ def test_boxes_of_the_live_detection_are_refused(recording, tmp_path, capsys):
     assert main(line) == 0
     cv2.imwrite(str(path), cv2.rectangle(image, (5, 5), (20, 20), (0, 255, 0), 3))
     assert main(line) == 2 and "left4.bmp: expected grey, found colour: boxes" in capsys.readouterr().err
+
+
+def test_frames_that_begin_with_other_numbers_are_told(recording, tmp_path, capsys, caplog):
+    """Without left0 and right10 every pair is of two moments; what the layout has no place for is refused."""
+    (recording / "L" / "left0.bmp").unlink()
+    for name in ("R/right10.bmp", "US/US10.bmp", "UScrop/US10.bmp"):
+        (recording / name).unlink()
+    line = ["import", "layout=stereo_basler", f"folder={recording}", f"out={tmp_path / 'capture'}"]
+    assert main(line) == 0
+    said = [record.getMessage() for record in caplog.records if "begins with right0.bmp" in record.getMessage()]
+    assert len(said) == 1 and "belong to L/left1.bmp: are the first ones lost?" in said[0]
+    assert main([*line, "speed_m_s=1488"]) == 2
+    assert "import: speed_m_s: expected none with layout=stereo_basler" in capsys.readouterr().err
 
 
 def test_a_recording_and_sets_name_each_other(recording, tmp_path, capsys):

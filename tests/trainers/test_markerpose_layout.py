@@ -131,6 +131,8 @@ def test_bad_tables_and_images_are_one_line(theirs, spoil, complaint):
 @pytest.mark.parametrize(("spoil", "complaint"), [
     (lambda folder: (folder / "mask120" / "000003.png").unlink(), "expected as many images in patch120/ as in mask120/"),
     (lambda folder: shutil.rmtree(folder / "patch120"), "found 0 and"),
+    (lambda folder: [(folder / "mask120" / "000003.png").unlink(), (folder / "patch120" / "000005.png").unlink()],
+     "mask120: expected the frame of patch120/000003.png next, found 000004.png: is one lost in between?"),
     (lambda folder: cv2.imwrite(str(folder / "mask120" / "000003.png"), np.zeros((60, 120), np.uint8)),
      "000003.png: expected 120x120 8-bit, found 120x60"),
     (lambda folder: cv2.imwrite(str(folder / "patch120" / "000003.png"), np.zeros((60, 120), np.uint8)),

@@ -58,6 +58,8 @@ def test_writes_the_network_and_goes_on(data_set, tmp_path, capsys):
         (["steps=1", "data=[]"], "train: data: expected"),
         (["steps=1", "data=3"], "train: data: expected"),
         (["steps=1", "memory_gb=-1"], "train: memory_gb: expected"),
+        (["steps=1", "memory_gb=inf"], "train: memory_gb: expected"),
+        (["steps=1", "checkpoint_minutes=inf"], "train: checkpoint_minutes: expected"),
         (["steps=1", "data=[/nowhere,/nowhere]"], "train: data: expected each folder once, found /nowhere twice"),
         (["steps=1", "init=/nowhere.pt"], "/nowhere.pt: expected weights, .safetensors or .pt, found none"),
     ],

@@ -42,7 +42,7 @@ def taken(optics: Calibration) -> Sequence[str]:
 
 def _is_model(text: str) -> bool:
     """Whether a text names a lens model as mrcal's files do."""
-    return re.search(r"""^\s*\{?\s*['"]lens_?model['"]\s*:""", text, re.MULTILINE) is not None
+    return re.search(r"""^[ \t]*(?:\{[ \t]*)?['"]lens_?model['"]\s*:""", text, re.MULTILINE) is not None
 
 
 def write(folder: Path, optics: Calibration) -> list[str]:

@@ -1,7 +1,8 @@
 """Folders of other groups' captures. Each module is a layout, by the name that `sonotwin import layout=NAME` has.
 
-A module has `read_capture(folder, known)`: reads and checks what is there, and returns a function that
-writes it with a `CaptureWriter` and returns lines about it; InputError before anything is written. `known` is a `Known`.
+A module has `TAKES`, names of the fields that it takes of `Known`, beyond which none may be given; and `read_capture(folder,
+known)`: reads and checks what is there, and returns a function that writes it with a `CaptureWriter` and returns lines about it;
+InputError before anything is written. `known` is a `Known`.
 """
 
 from dataclasses import dataclass

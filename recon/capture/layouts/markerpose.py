@@ -14,6 +14,7 @@ from recon.capture.writer import CaptureWriter
 from recon.errors import InputError
 from recon.model.calibration import Calibration
 
+TAKES = ("camera_hz", "purpose")
 IMAGES, PARAMETERS = "images", meza2021.STEREO_XML
 
 

@@ -6,7 +6,6 @@ to 8, projector column (width - 1) / 2 at phase zero.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -23,7 +22,7 @@ from recon.capture.meza2021_sweep import AuthorsSweep
 from recon.capture.surface_part import SurfaceCapture
 from recon.capture.writer import CaptureWriter
 from recon.errors import InputError, validated
-from recon.files import atomic, json_text
+from recon.files import json_text
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
 from recon.model.calibration import Calibration
@@ -32,6 +31,7 @@ from recon.model.probe import ProbeCalibration, Speed
 from recon.model.rig import Part
 from recon.model.tracks import Track
 
+TAKES = ("camera_hz", "purpose", "projector_size", "speed_m_s")
 STEPS = 8
 PITCH = 12.0  # projector px
 PROJECTOR_SIZE = (1280, 800)  # px; their files don't store it
@@ -196,20 +196,6 @@ def _images(sweep: AuthorsSweep) -> Iterator[tuple[str, NDArray]]:
     for name, paths in sweep.images.items():
         for path in paths:
             yield name, read_grey(path, sweep.sizes[name])
-
-
-@contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
-    """Give a folder to be filled in their layout, which appears whole or not at all, and replaces such a one of ours alone.
-
-    Raises
-    ------
-    InputError
-        If the place is taken by something else, a folder of theirs included, or can't be written to.
-    """
-    with atomic.new_folder(folder, "export") as temporary:
-        mark(temporary)
-        yield temporary
 
 
 def mark(folder: Path, speed_m_s: float | None = None) -> None:

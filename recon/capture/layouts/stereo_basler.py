@@ -8,14 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from recon.capture import meza2021_sweep
-from recon.capture.image_formats import decode_image
 from recon.capture.layouts import STILLS_HZ, Known, meza2021, us_calibration
-from recon.capture.manifest import CAMERAS, SCANNER
+from recon.capture.manifest import SCANNER
 from recon.capture.meza2021_sweep import CROPPED, FOLDERS
 from recon.capture.writer import CaptureWriter
 from recon.errors import InputError
-from recon.files.regular import read_bytes
 
+TAKES = ("camera_hz", "purpose")
 CROP = (247, 67, 321, 408)  # u, v, width, height px of the B-scan in their scanner's screen of 800x600
 
 
@@ -34,9 +33,7 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
         raise InputError(
             f"{folder}: expected L, R and US or UScrop with images, as StereoBaslerUltrasound saves them, found none{way}"
         )
-    for device in CAMERAS:
-        for path in found.images.get(device, ()):
-            _check_grey(path)
+    us_calibration.check_grey(found)
     optics, about = us_calibration.read_cameras(folder, found.sizes)
 
     def fill(capture: CaptureWriter) -> list[str]:
@@ -50,12 +47,3 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
         return lines
 
     return fill
-
-
-def _check_grey(path: Path) -> None:
-    """Refuse a frame with their live detection's green boxes, over the very rims; grey stored as colour is none."""
-    image = decode_image(path, read_bytes(path))
-    if image.ndim == 3 and (image[..., 0] != image[..., 1]).any() and path.suffix.lower() not in (".jpg", ".jpeg"):
-        raise InputError(
-            f"{path}: expected grey, found colour: boxes of the live detection (key t)? Leave its images out of all folders"
-        )

@@ -13,17 +13,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture import calibration_files, meza2021_sweep, probe_files
+from recon.capture import calibration_files, manifest, meza2021_sweep, probe_files
+from recon.capture.image_formats import decode_image
 from recon.capture.images import Size, natural_key
 from recon.capture.layouts import STILLS_HZ, Known, meza2021
 from recon.capture.manifest import SCANNER
 from recon.capture.meza2021_sweep import AuthorsSweep
 from recon.capture.writer import CaptureWriter
 from recon.errors import InputError
+from recon.files.regular import read_bytes
 from recon.model.calibration import Calibration
 
 Array = NDArray[np.float64]
 
+TAKES = ("camera_hz", "purpose", "speed_m_s")
 SET = "data"  # in the name of each set
 CAMERAS = ("cam1_cam2.npz", "cam1_cam2_params.npz", "Params.mat", "StereoParams.xml")  # the first that is there; ours the first
 RESULT = "USparams.npz"
@@ -37,10 +40,10 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
     Raises
     ------
     InputError
-        If there is no set, or a file is damaged or doesn't fit the others.
+        If there is no set, a file is damaged or doesn't fit the others, or frames have boxes drawn into them.
     """
     sets = read_sets(folder)
-    sizes = sizes_of(folder, sets)
+    sizes = sizes_of(sets)
     optics, about = read_cameras(folder, sizes)
     result = folder / RESULT
     probe = probe_files.read(result, known.speed_m_s) if os.path.lexists(result) else None
@@ -62,7 +65,7 @@ def read_capture(folder: Path, known: Known) -> Callable[[CaptureWriter], list[s
 
 
 def read_sets(folder: Path) -> dict[str, AuthorsSweep]:
-    """Read the sets : name of the sweep -> frames, in natural order; InputError if there is none, or two have one name."""
+    """Read the sets : name of the sweep -> frames, in natural order; raises as `read_capture` does, and if two have one name."""
     sets: dict[str, AuthorsSweep] = {}
     places = sorted((path for path in folder.iterdir() if path.is_dir()), key=natural_key) if folder.is_dir() else []
     for place in places:
@@ -71,6 +74,7 @@ def read_sets(folder: Path) -> dict[str, AuthorsSweep]:
             continue
         if SCANNER not in found.images:
             raise InputError(f"{place}: expected B-scans in {meza2021_sweep.CROPPED}/ or US/, found none")
+        check_grey(found)
         name = re.sub(r"[^a-z0-9_-]", "-", place.name.lower()).lstrip("0123456789_-")[:64]
         if name in sets:
             raise InputError(f"{place}: expected a name that differs from the others' in small letters, found {name} again")
@@ -86,14 +90,24 @@ def read_sets(folder: Path) -> dict[str, AuthorsSweep]:
     return sets
 
 
-def sizes_of(folder: Path, sets: dict[str, AuthorsSweep]) -> dict[str, Size]:
+def check_grey(frames: AuthorsSweep) -> None:
+    """Refuse frames with their acquisition's green boxes, over the very rims; grey stored as colour is none."""
+    for path in (path for device in manifest.CAMERAS for path in frames.images.get(device, ())):
+        image = decode_image(path, read_bytes(path))
+        if image.ndim == 3 and (image[..., 0] != image[..., 1]).any() and path.suffix.lower() not in (".jpg", ".jpeg"):
+            raise InputError(
+                f"{path}: expected grey, found colour: boxes of the live detection (key t)? Leave its images out of all folders"
+            )
+
+
+def sizes_of(sets: dict[str, AuthorsSweep]) -> dict[str, Size]:
     """Sizes of the devices' images, px; InputError if they differ between sets."""
     sizes: dict[str, Size] = {}
-    for name, found in sets.items():
+    for found in sets.values():
         for device, size in found.sizes.items():
             if sizes.setdefault(device, size) != size:
                 expected = "x".join(map(str, sizes[device]))
-                place = folder / name / found.folders[device]
+                place = found.images[device][0].parent
                 raise InputError(
                     f"{place}: expected images of {expected} px, as in {next(iter(sets))}, found {size[0]}x{size[1]}"
                 )

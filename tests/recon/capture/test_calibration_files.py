@@ -499,6 +499,13 @@ def test_wrong_values_are_refused_in_one_line(optics, tmp_path, fault, complaint
     assert str(refusal.value).startswith(f"{path}: {complaint}") and "\n" not in str(refusal.value)
 
 
+def test_a_file_of_line_breaks_is_refused(tmp_path):
+    """At once: a search that takes any blank for a line's beginning would go on for minutes."""
+    (tmp_path / "optics.xml").write_text("\n" * 4096, encoding="ascii")
+    with pytest.raises(InputError, match=r"optics\.xml: expected an npz file or OpenCV's YAML"):
+        calibration_files.read(tmp_path / "optics.xml")
+
+
 def test_damaged_files_are_refused_in_one_line(optics, tmp_path):
     """Cut at every tenth of its length, or not a calibration at all."""
     calibration_files.write(tmp_path / "optics.yaml", Calibration(optics.cameras, uncertain(NAMES)))

@@ -194,6 +194,8 @@ def test_what_is_wrong_with_runs_is_said_in_one_line(pairs, singles, rig, tmp_pa
         capsys, listed(pairs), f"pairs={pairs[0]}", *fields
     )
     assert complaint(capsys, listed([pairs[0], tmp_path / "none.csv"]), *fields).endswith("expected a file, found none")
+    (tmp_path / "loop").symlink_to("loop")
+    assert complaint(capsys, listed([pairs[0], tmp_path / "loop"]), *fields).endswith("found too many levels of symbolic links")
     assert "found neither manifest.json nor probe.yaml" in complaint(capsys, listed([pairs[0], tmp_path]), *fields)
     assert "found a sequence: calibrate by each" in complaint(capsys, listed([pairs[0], "a.igs.mha"]), *fields)
     deeper = replace(probe_files.read(singles[0] / "probe.yaml"), scale=np.array([0.1229, 0.15]))
