@@ -35,7 +35,9 @@ from recon.registry import Choice
 OF_SOME_VERBS = {  # choices of a group that only these verbs take
     "devices/virtual": ("record",),
     **dict.fromkeys(("path/hand", "path/pivot"), ("film",)),
-    **dict.fromkeys(("path/bob", "path/none", "path/raster", "path/stroke", "path/wire"), ("demo", "record", "sweep")),
+    **dict.fromkeys(
+        ("path/bob", "path/none", "path/raster", "path/rows", "path/stroke", "path/wire"), ("demo", "record", "sweep")
+    ),
 }
 NEEDED = "???"  # Hydra's mark of a field that needs a value
 BESIDE, WIDTH = 26, 100  # columns before the descriptions of fields in a verb's help, and of these

@@ -58,7 +58,7 @@ def test_both_cameras_see_the_circles_whole(config):
 
 def test_films_have_paths_of_their_own():
     assert groups("film")["path"] == ["hand", "pivot"]
-    assert groups("sweep")["path"] == ["bob", "none", "raster", "stroke", "wire"]
+    assert groups("sweep")["path"] == ["bob", "none", "raster", "rows", "stroke", "wire"]
     with pytest.raises(InputError, match=r"path"):
         load("sweep", ["out=unused", "path=pivot"], sweep.Config)
     with pytest.raises(InputError, match=r"tip_mm"):
