@@ -53,6 +53,11 @@ class SweepSettings(Part):
         if self.filmed and self.frames.exposure_s * self.clocks.camera_hz > 1:
             expected = f"at most 1 / clocks.camera_hz = {1 / self.clocks.camera_hz:.4g}"
             raise ValueError(f"frames.exposure_s: expected {expected}, found {self.frames.exposure_s:g}")
+        if self.filmed and self.rig.bodies:
+            others = ", ".join(self.rig.bodies)
+            raise ValueError(
+                f"rig.bodies: expected none with filmed=true, as sweeps film the probe alone, found {others}: take another rig"
+            )
         if self.filmed and self.seed >= 2**32:
             raise ValueError(f"seed: expected less than 2^32 with filmed=true, found {self.seed}")
         return self

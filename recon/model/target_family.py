@@ -10,6 +10,7 @@ from recon.model.rig import LEAST_PARTED_MM, Target, parted_mm
 MOST = 6  # bodies
 SIDES_MM = range(24, 61, 4)  # of c1 and c2 that are tried, beside those of the first target
 ASIDE_MM = (0.0, 12.0, -12.0)
+SCALENE_MM = 3.0  # by which sides differ: circles of which two sides are alike have names by their sense of rotation alone
 WHITE_MM = 3.0  # between two circles, at least
 
 
@@ -45,7 +46,8 @@ def _others(first: Target) -> list[Target]:
     usual = first.named(Target.USUAL)
     found = []
     for c1, c2, aside in product(SIDES_MM, SIDES_MM, ASIDE_MM):
-        if min(c1, abs(complex(aside, c2)), abs(complex(c1 - aside, c2))) < clear:
+        sides = sorted([c1, abs(complex(aside, c2)), abs(complex(c1 - aside, c2))])
+        if sides[0] < clear or min(sides[1] - sides[0], sides[2] - sides[1]) < SCALENE_MM:
             continue
         around = np.array([max(c1, aside) - min(0.0, aside), c2]) + first.outer_diameter_mm + white
         lengths = {"c1_mm": float(c1), "c2_mm": float(c2), "c2_aside_mm": aside, "board_mm": tuple(np.ceil(around).tolist())}

@@ -27,6 +27,7 @@ from recon.tracking.results import BODIES, Step
 from recon.tracking.tracker import Tracker, Tracking, is_beside
 
 BY = "track"  # who writes
+FAR_MM, FAR_DEG = 60.0, 30.0  # of a patient from the reference, beyond which it is hardly the same patient, or session
 REFERENCE = f"{BODIES}/{PATIENT}/reference.csv"
 
 
@@ -74,10 +75,10 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
         start = perf_counter()
         steps = track(film, tracker, folder if settings.overlays else None, watch)
         reference = reference or (first_seen(steps[PATIENT]) if beside_patient else None)
-        moved = None if reference is None else describe_motion(steps[PATIENT], reference, watch)
-        if reference is not None:
+        moved = describe_motion(steps[PATIENT], reference, watch) if beside_patient else {}
+        if beside_patient:
             steps |= beside(steps, reference)
-        figures = report(steps, targets, watch) | (moved or {})
+        figures = report(steps, targets, watch) | moved
         results.write_poses(folder, film, steps[PROBE])
         for name in steps.keys() - {PROBE}:
             (folder / BODIES / name).mkdir(parents=True)
@@ -198,8 +199,9 @@ def read_reference(path: Path) -> Reference:
         If the file is missing or damaged, or has no pose.
     """
     given = sweep_tables.read_track(path)
-    if not given.found.any():
-        raise InputError(f"{path}: expected a pose of the {PATIENT}, found none")
+    if (count := int(given.found.sum())) != 1:
+        found = "none" if not count else f"{count}: the table of a film? reference.csv stands beside the patient's"
+        raise InputError(f"{path}: expected a pose of the {PATIENT}, found {found}")
     whole = given.covariance if given.covariance is None or given.shared is None else given.covariance + given.shared
     return Reference(Track(given.times, given.poses, whole), str(path))
 
@@ -216,11 +218,12 @@ def first_seen(steps: Sequence[Step]) -> Reference | None:
     return None if first is None else Reference(results.track_of([first]), "its first pose in this film")
 
 
-def beside(steps: Mapping[str, Sequence[Step]], reference: Reference) -> dict[str, list[Step]]:
-    """Steps of all bodies but the patient, as if that stood where it stood at the reference."""
+def beside(steps: Mapping[str, Sequence[Step]], reference: Reference | None) -> dict[str, list[Step]]:
+    """Steps of all bodies but the patient, as if that stood where it stood at the reference; without one no pose is known."""
     patient, told = results.track_of(steps[PATIENT]), {}
+    nowhere = Track(np.zeros(1, np.int64), np.eye(4)[None])
     for name in steps.keys() - {PATIENT}:
-        own = tracks.relative(results.track_of(steps[name]), patient, reference.pose)
+        own = tracks.relative(results.track_of(steps[name]), patient, nowhere if reference is None else reference.pose)
         assert own.covariance is not None and own.shared is not None
         lost = np.full((6, 6), np.nan)
         told[name] = [
@@ -236,13 +239,17 @@ def beside(steps: Mapping[str, Sequence[Step]], reference: Reference) -> dict[st
     return told
 
 
-def describe_motion(steps: Sequence[Step], reference: Reference, watch: Watch) -> Metrics:
+def describe_motion(steps: Sequence[Step], reference: Reference | None, watch: Watch) -> Metrics:
     """Say how far the patient moved since the reference, which is taken out of poses; returns the figures, NaN of one unseen."""
+    seen = [step.world_from_target for step in steps if step.found]
+    if reference is None or not seen:
+        watch.say(f"{'patient':11} never seen: no pose is told, as where skin and masses lie beside the cameras isn't known")
+        return {"patient_moved_mm": np.nan, "patient_turned_deg": np.nan}
     first = reference.pose.poses[int(np.argmax(reference.pose.found))]
-    moves = np.array([rigid.difference(first, step.world_from_target) for step in steps if step.found]).reshape(-1, 6)
-    turn, shift = (float(np.linalg.norm(part, axis=1).max(initial=-np.inf)) for part in (moves[:, :3], moves[:, 3:]))
-    seen = bool(len(moves))
-    figures: Metrics = {"patient_moved_mm": shift if seen else np.nan, "patient_turned_deg": np.rad2deg(turn) if seen else np.nan}
-    moved = f"by up to {shift:.2f} mm and {np.rad2deg(turn):.2f} deg" if seen else "unknown, as it isn't seen"
-    watch.say(f"patient     moved since {reference.source}: {moved}; all poses are told as if it stood there")
-    return figures
+    moves = np.array([rigid.difference(first, pose) for pose in seen])
+    turn, shift = (float(np.linalg.norm(part, axis=1).max()) for part in (moves[:, :3], moves[:, 3:]))
+    watch.say(f"{'patient':11} moved since {reference.source} by up to {shift:.2f} mm and {np.rad2deg(turn):.2f} deg")
+    watch.say(f"{'world':11} all poses but the patient's are told as if it had stayed there")
+    if shift > FAR_MM or np.rad2deg(turn) > FAR_DEG:
+        watch.say(f"{'warning':11} the patient is far from {reference.source}: is that another session's, or another body's?")
+    return {"patient_moved_mm": shift, "patient_turned_deg": float(np.rad2deg(turn))}

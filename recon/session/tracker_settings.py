@@ -3,11 +3,13 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
 from recon.capture import target_files
 from recon.errors import InputError, did_you_mean
 from recon.geometry.camera import Camera
+from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, Uncertainty
 from recon.model.part import Part
 from recon.model.rig import PROBE, Rig, Target
@@ -17,6 +19,8 @@ from recon.tracking import networks
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.networks import OnnxNetworks
 from recon.tracking.tracker import Tracker
+
+OTHER_MM, OTHER_TOLERANCES = 1.0, 10.0  # off its design, by which a measured target is another body's, or tolerances of a circle
 
 
 class NetworkFields(Part):
@@ -76,11 +80,17 @@ def targets_of(fields: BodyFields) -> dict[str, Target]:
         As of `recon.capture.target_files.read`, or if a measured one is of no body of the rig.
     """
     bodies = fields.rig.bodies
-    for name, path in fields.measured.items():
+    for name in fields.measured:
         if name not in bodies:
             expected = f"one of rig.bodies, {', '.join(bodies)}" if bodies else "none, as rig.bodies names none"
-            raise InputError(f"measured.{name}: expected {expected}, found {path}{did_you_mean(name, list(bodies))}")
+            raise InputError(f"measured.{name}: expected {expected}, found {name}{did_you_mean(name, list(bodies))}")
     read = {name: target_files.read(path, bodies[name]) for name, path in fields.measured.items()}
+    for name, measured in read.items():
+        off = circle_layout.lengths(measured) - circle_layout.lengths(bodies[name])
+        if np.abs(off).max() > (most := max(OTHER_MM, OTHER_TOLERANCES * bodies[name].tolerance_mm)):
+            worst = int(np.abs(off).argmax())
+            found = f"{measured.LENGTHS[worst]} off by {off[worst]:+.2f} mm: another body's?"
+            raise InputError(f"measured.{name}: {fields.measured[name]}: expected its design to {most:g} mm, found {found}")
     return {PROBE: target_of(fields), **bodies, **read}
 
 

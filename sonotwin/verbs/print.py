@@ -117,15 +117,18 @@ def draw_targets(config: Config, first: Target) -> None:
         pages.append(page(card, placed(config, card, ""), target_drawing.in_words(target), notes))
     title = target_drawing.in_words(first) if len(targets) == 1 else f"{len(targets)} targets"
     write(config, pages, title)
-    report(
-        config, pages[0].card, pages[0].sheet, "sonotwin calibrate-target capture=film out=target  # of a film of it as printed"
-    )
+    own = "" if config.body == PROBE else f" body={config.body}"
+    following = f"sonotwin calibrate-target capture=film{own} out=target  # of a film of it as it was printed"
+    report(config, pages[0].card, pages[0].sheet, following)
+    if len(targets) > 1:
+        print(f"page 1      the {config.body}'s; in a rig's file, with names of your own for the others:")
+        print("            bodies:")
     for number, target in enumerate(targets[1:], start=2):
         parted = min(parted_mm(target, other) for other in targets if other is not target)
         given = (*target.LENGTHS, "outer_diameter_mm", "inner_diameter_mm", "board_mm")
         described = target.model_dump(mode="json")
         fields = ", ".join(f"{name}: {described[name]}" for name in given)
-        print(f"page {number}      parted by {parted:.1f} mm from the others; in a rig's file: bodies: {{NAME: {{{fields}}}}}")
+        print(f"              body{number}: {{{fields}}}  # page {number}, parted by {parted:.1f} mm from the others")
 
 
 def near(name: str, rig: Rig) -> str:

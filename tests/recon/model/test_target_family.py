@@ -77,6 +77,7 @@ def test_shipped_targets_make_rigs_with_the_probes_own_or_in_its_place():
     bodies = choices.read_rig("three_bodies").bodies
     for name in ("needle", "patient"):
         assert bodies[name].model_dump() == Target.model_validate(choices.read("target", name)).model_dump()
+    assert propose(choices.read_rig().target, 3)[1:] == [bodies["patient"], bodies["needle"]]  # what is printed is the rig
     marker = Target.model_validate(choices.read("target", "markerpose"))
     assert parted_mm(marker, choices.read_rig().target) == pytest.approx(0, abs=1e-9)
     Rig.model_validate(choices.read_rig("three_bodies").model_dump() | {"target": marker.model_dump()})

@@ -188,3 +188,17 @@ def test_wires_and_bottoms_are_told_in_the_cameras_world(rig, places, tmp_path):
     assert np.linalg.norm(found[:, :3, 3] - expected[:3, 3], axis=1).max() < 0.1
     with pytest.raises(InputError, match="reference: expected none for a sweep of purpose probe"):
         track(rig, source, tmp_path / "again", reference=tmp_path / "reference.csv")
+
+
+def test_a_patient_who_is_never_seen_leaves_no_pose_of_a_film_alone(rig, places, tmp_path):
+    """Without fringes, too: which world that would be isn't known."""
+    source = capture(tmp_path / "capture", rig, places, MOVED, np.random.default_rng(9), fringes=(), away=("patient",))
+    steps = track(rig, source, tmp_path / "out")
+    assert not any(step.found for step in steps["probe"])
+    assert not (tmp_path / "out" / poses_step.REFERENCE).exists()
+
+
+def test_a_films_table_is_no_reference(rig, filmed, tmp_path):
+    track(rig, filmed, tmp_path / "out")
+    with pytest.raises(InputError, match=r"poses\.csv: expected a pose of the patient, found 3: the table of a film"):
+        track(rig, filmed, tmp_path / "again", reference=tmp_path / "out" / "poses.csv")

@@ -59,5 +59,11 @@ def test_bodies_have_their_measured_targets(tmp_path):
     found = targets_of(fields)
     assert list(found) == ["probe", "needle", "patient"] and found["patient"] == rig.bodies["patient"]
     assert found["needle"].c1_mm == pytest.approx(24.05) and found["needle"].covariance_mm2 is not None
-    with pytest.raises(InputError, match=r"measured\.nedle: expected one of rig\.bodies, needle, patient.*did you mean needle"):
+    with pytest.raises(
+        InputError, match=r"measured\.nedle: expected one of rig\.bodies, needle, patient.*found nedle; did you mean needle"
+    ):
         targets_of(fields.model_copy(update={"measured": {"nedle": tmp_path / "needle.yaml"}}))
+    other = rig.bodies["needle"].model_copy(update={"c1_mm": 26.5})
+    target_files.write(tmp_path / "other.yaml", other, 1e-4 * np.eye(7))
+    with pytest.raises(InputError, match=r"measured\.needle: .*expected its design to 1 mm, found c1_mm off by \+2\.50 mm"):
+        targets_of(fields.model_copy(update={"measured": {"needle": tmp_path / "other.yaml"}}))
