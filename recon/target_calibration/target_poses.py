@@ -126,13 +126,13 @@ def check(pairs: Sequence[Seen], name: str, collected: Collected, least_tilt_deg
         If pairs, tilts or distances are missing, with what to do.
     """
     if len(pairs) < LEAST:
-        expected = f"{LEAST} poses in which both cameras see all circles whole"
+        expected = f"{LEAST} different poses, by 2 mm or 1 deg, in which both cameras see all circles whole"
         raise InputError(f"{name}: expected {expected}, found {len(pairs)}{collected.told}")
     missing = []
     if (tilt := tilt_deg(pairs)) < least_tilt_deg:
         missing.append(f"tilts that differ by {least_tilt_deg:g} deg (standard deviation; to all sides), found {tilt:.1f}")
     if (reach := range_mm(pairs)) < least_range_mm:
-        missing.append(f"distances over {least_range_mm:g} mm, found {reach:.0f}")
+        missing.append(f"distances over {least_range_mm:g} mm, found {reach:.1f}")
     if missing:
         way = "turn the target to all sides, nearer and farther; or set least_tilt_deg, least_range_mm"
         raise InputError(f"{name}: expected {'; and '.join(missing)}: {way}")

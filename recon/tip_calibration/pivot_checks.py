@@ -37,6 +37,7 @@ ASIDE_DEG = 15.0  # of the shaft from the way between the target's origin and th
 BEND_MM = 1.0  # one standard deviation of a usual bend's numbers beforehand
 MOST_COURSES = 500  # frames in which a movement is looked for, evenly out of all
 MOST_OUTLIERS = 0.25  # of the poses
+NO_PIVOT_MM = 5.0  # of a motion, beyond which a tool didn't pivot, and nobody means it
 ALIKE = 4.0  # neighbours whose residuals are alike, from which on it is said
 NAMED = 5  # frames, of a message
 
@@ -129,7 +130,7 @@ def _check_turns(frames: Frames, demands: Demands, name: str) -> None:
     first, second, _ = turns_deg(frames.poses)
     if second < demands.least_turn_deg:
         cause = "in one plane only, or about one axis" if first > 2 * second else "too little"
-        found = f"{first:.1f} and {second:.1f}: it turned {cause}"
+        found = f"{first:.2f} and {second:.2f}: it turned {cause}"
         way = f"tilt it by 30 deg to all sides about its tip, or give least_turn_deg={0.8 * second:.2g}"
         expected = f"a tool that turns about two axes by {demands.least_turn_deg:g} deg each (standard deviation)"
         raise InputError(f"{name}: expected {expected}, found {found}; {way}")
@@ -143,7 +144,8 @@ def _check_rest(
     if large := [(size, text) for _, size, text in shown if size > most]:
         size, text = large[0]
         expected = f"a tip at rest in its dimple, and a target firm on a stiff tool, to {most:g} mm"
-        raise InputError(f"{name}: expected {expected}, found {text}; {film}, or give most_motion_mm={1.2 * size:.2g} to take it")
+        way = f", or give most_motion_mm={1.2 * size:.2g} to take it" if size < NO_PIVOT_MM else ""
+        raise InputError(f"{name}: expected {expected}, found {text}; {film}{way}")
     outliers = ~found.used
     if outliers.mean() > MOST_OUTLIERS:
         expected = f"poses that agree on a tip, but for {100 * MOST_OUTLIERS:.0f} %"

@@ -139,4 +139,4 @@ def test_what_is_wrong_is_said_in_one_line(drawn, told, tmp_path, capsys):
 def test_a_film_too_short_is_refused(rig, told, tmp_path, capsys):
     capture = films.film(tmp_path / "capture", rig, np.random.default_rng(4), count=2)
     assert main(["calibrate-target", f"capture={capture}", f"out={tmp_path / 'out'}"]) == 2
-    assert "expected 8 poses in which both cameras see all circles whole, found" in capsys.readouterr().err
+    assert "expected 8 different poses, by 2 mm or 1 deg, in which both cameras see all" in capsys.readouterr().err

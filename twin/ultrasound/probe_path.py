@@ -182,6 +182,9 @@ def _rests(poses: Array, rest_s: float) -> tuple[Track, NDArray[np.int64]]:
     return rests, starts + steps[-1] // 2
 
 
+LEVEL = np.cos(np.deg2rad(20))  # of the wires' direction, the part that is level
+
+
 def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
     """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
 
@@ -202,6 +205,10 @@ def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) 
         [path.tilt_deg], [path.roll_deg], [path.rock_deg], [path.along_mm]
     ]  # fmt: skip
     array = np.array([along[1], -along[0], 0.0])  # across wires that lie level
+    if (level := float(np.linalg.norm(array))) < LEVEL:
+        found = f"them {np.degrees(np.arccos(level)):.0f} deg from it: z of their definition is up"
+        raise InputError(f"path: expected wires that lie level, to be crossed from above, found {found}")
+    array /= level
     upright = np.column_stack([array, [0, 0, 1], np.cross(array, [0, 0, 1])])
     rotations = upright @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
     true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
