@@ -50,10 +50,7 @@ def read(path: Path, design: Target) -> Target:
     InputError
         If the file is missing, damaged, of another kind, or a value is missing or can't be.
     """
-    stored = opencv_storage.read(path, "a measured target") or {}
-    if stored.get("schema") != SCHEMA:
-        found = short(stored["schema"]) if isinstance(stored.get("schema"), str) else "none"
-        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    stored = opencv_storage.read_schema(path, "a measured target", SCHEMA)
     values: dict[str, object] = {name: _number(path, name, stored.get(name)) for name in lengths_and_diameter(design)}
     curvature = opencv_storage.matrix(path, CURVATURE, stored.get(CURVATURE))
     if curvature.size != 3 or not np.isfinite(curvature).all():

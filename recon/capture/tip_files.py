@@ -52,10 +52,7 @@ def read(path: Path) -> Tip:
     InputError
         If the file is missing, damaged, of another kind, or a value is missing or can't be.
     """
-    values = opencv_storage.read(path, "a tool's tip") or {}
-    if values.get("schema") != SCHEMA:
-        found = short(values["schema"]) if isinstance(values.get("schema"), str) else "none"
-        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    values = opencv_storage.read_schema(path, "a tool's tip", SCHEMA)
     tip = _vector(path, values, "tip_mm")
     axis, dimple = (_vector(path, values, name) if name in values else None for name in ("axis", "dimple_mm"))
     if axis is not None and abs(np.linalg.norm(axis) - 1) > OFF_LENGTH:

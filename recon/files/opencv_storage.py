@@ -14,7 +14,7 @@ import yaml
 from numpy.typing import NDArray
 from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, DocumentStartEvent, ScalarEvent, SequenceStartEvent
 
-from recon.errors import InputError, brief
+from recon.errors import InputError, brief, short
 from recon.files import atomic, json_text, regular, xml_text, yaml_text
 
 Array = NDArray[np.float64]
@@ -70,6 +70,25 @@ def read(path: Path, expected: str) -> Values | None:
     most = max(len(text), yaml_text.MOST_VALUES)  # by what is written, which aliases can't multiply
     documents = _of_events(yaml_text.events(path, HEADER.sub("", text), most))
     return {key: value for document in reversed(documents) for key, value in _map(document).items()}  # as a file is extended
+
+
+def read_schema(path: Path, expected: str, schema: str) -> Values:
+    """Values in a file of a schema.
+
+    Parameters
+    ----------
+    expected : as of `read`
+
+    Raises
+    ------
+    InputError
+        As of `read`, or if its schema is missing or another one.
+    """
+    values = read(path, expected) or {}
+    if values.get("schema") != schema:
+        found = short(values["schema"]) if isinstance(values.get("schema"), str) else "none"
+        raise InputError(f"{path}: schema: expected {schema}, found {found}")
+    return values
 
 
 def _map(value: Any) -> Values:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from recon.capture.probe_values import checked, states_unit, within_speeds
-from recon.errors import InputError, brief, short
+from recon.errors import InputError, brief
 from recon.files import opencv_storage
 from recon.files.opencv_storage import Values
 from recon.files.regular import read_bytes
@@ -33,10 +33,7 @@ def recognises(path: Path) -> bool:
 
 def read(path: Path, speed_m_s: float | None = None) -> ProbeCalibration:
     """Read it; its own speed of sound counts."""
-    values = opencv_storage.read(path, "a probe's calibration") or {}
-    if values.get("schema") != SCHEMA:
-        found = short(values["schema"]) if isinstance(values.get("schema"), str) else "none"
-        raise InputError(f"{path}: schema: expected {SCHEMA}, found {found}")
+    values = opencv_storage.read_schema(path, "a probe's calibration", SCHEMA)
     pose = opencv_storage.matrix(path, "target_from_image", values.get("target_from_image"))
     scale = opencv_storage.matrix(path, "scale", values.get("scale")).ravel()
     face_row = values.get("face_row", 0.0)
