@@ -19,7 +19,7 @@ from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import PATIENT, PROBE, Target
 from recon.model.tracks import Track
-from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
+from recon.session.tracker_settings import BodyFields, make_rig_tracker, targets_of
 from recon.session.watch import SILENT, Watch
 from recon.tracking import results, track_figures
 from recon.tracking.bodies import BodyTracker
@@ -65,7 +65,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
     atomic.check_folder(out, BY, inputs=(settings.capture, *given))
     film = stereo_frames.read_film(settings.capture, settings.calibration, settings.sweep)
     targets = targets_of(settings)
-    tracker = _tracker(settings, film)
+    tracker = make_rig_tracker(settings, targets, film.cameras, film.optics, film.bits)
     rate = f", {film.rate_hz:.4g} a second" if np.isfinite(film.rate_hz) else ""
     sizes = " and ".join(dict.fromkeys("x".join(map(str, camera.size)) for camera in film.cameras))
     watch.say(f"read        {len(film.times)} pairs of frames, {sizes}{rate}")
@@ -95,13 +95,6 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> dict[str, list[
             body = f" of the {name}" if len(steps) > 1 else ""
             watch.warn(f"{film.name}: no pose{body} in {len(own)} pairs: {reason} ({number}); see frames.csv")
     return steps
-
-
-def _tracker(settings: Settings, film: Film) -> Tracker | BodyTracker:
-    """A tracker of the probe alone, or of all bodies of the rig."""
-    if settings.rig.bodies:
-        return make_body_tracker(settings, film.cameras, film.optics, film.bits)
-    return make_tracker(settings, targets_of(settings)[PROBE], film.cameras, film.optics, film.bits)
 
 
 def report(steps: Mapping[str, list[Step]], targets: Mapping[str, Target], watch: Watch) -> Metrics:

@@ -1,5 +1,6 @@
 """Settings of steps that track the target, and the networks and the tracker that they make."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -94,13 +95,32 @@ def targets_of(fields: BodyFields) -> dict[str, Target]:
     return {PROBE: target_of(fields), **bodies, **read}
 
 
+def make_rig_tracker(
+    fields: BodyFields,
+    targets: Mapping[str, Target],
+    cameras: tuple[Camera, Camera],
+    known: Uncertainty | None,
+    bits: int | None,
+    search_s: float = 0.0,
+) -> Tracker | BodyTracker:
+    """The tracker of the probe alone, or of all bodies where the rig has any; targets as of `targets_of`."""
+    if fields.rig.bodies:
+        return make_body_tracker(fields, targets, cameras, known, bits, search_s)
+    return make_tracker(fields, targets[PROBE], cameras, known, bits)
+
+
 def make_body_tracker(
-    fields: BodyFields, cameras: tuple[Camera, Camera], known: Uncertainty | None, bits: int | None, search_s: float = 0.0
+    fields: BodyFields,
+    targets: Mapping[str, Target],
+    cameras: tuple[Camera, Camera],
+    known: Uncertainty | None,
+    bits: int | None,
+    search_s: float = 0.0,
 ) -> BodyTracker:
     """The tracker of all bodies of a rig; see `make_tracker`, and `BodyTracker` for `search_s`."""
     loaded = networks.load(fields.networks or networks.WEIGHTS, fields.threads, fields.rig.target.kind, by_geometry=True)
     settings = bits, known, fields.drift_px, fields.board_scale
-    trackers = {name: Tracker(cameras, target, loaded, *settings) for name, target in targets_of(fields).items()}
+    trackers = {name: Tracker(cameras, target, loaded, *settings) for name, target in targets.items()}
     return BodyTracker(trackers, search_s)
 
 

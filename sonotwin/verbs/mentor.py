@@ -44,7 +44,7 @@ from recon.model.rig import PATIENT
 from recon.navigation.feeds import Device
 from recon.segmentation import containment, mass_files
 from recon.session import poses_step
-from recon.session.tracker_settings import BodyFields, make_body_tracker
+from recon.session.tracker_settings import BodyFields, make_body_tracker, targets_of
 from recon.skin_projection import mass_outline, outline_names, planned_cut, projector_image
 from recon.skin_projection.live_picture import LivePicture, Strips
 from recon.skin_projection.projector_image import Lines, lit_share
@@ -245,7 +245,7 @@ def still_curves(config: Config, skin: trimesh.Trimesh, projector: Camera) -> li
 def follower(config: Config, known: Calibration, bits: int) -> Follow:
     """Where the patient carries the skin."""
     cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
-    tracker = make_body_tracker(config, cameras, known.uncertainty, bits if bits > 8 else None, SEARCH_S)
+    tracker = make_body_tracker(config, targets_of(config), cameras, known.uncertainty, bits if bits > 8 else None, SEARCH_S)
     alone = BodyTracker({PATIENT: tracker.trackers[PATIENT]}, SEARCH_S)
     reference = reference_of(config, alone)
     return by_patient(alone, reference)

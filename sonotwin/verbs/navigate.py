@@ -47,7 +47,7 @@ from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.navigation.tool_figures import Alarms
 from recon.probe_calibration import sound_in_water
 from recon.session import poses_step
-from recon.session.tracker_settings import BodyFields, make_body_tracker, make_tracker, targets_of
+from recon.session.tracker_settings import BodyFields, make_rig_tracker, targets_of
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker
 from sonotwin import live_sources
@@ -245,9 +245,7 @@ def tracker_of(config: Config, sizes: Mapping[str, Size], bits: int) -> Tracker 
     path = given_or_held(config.calibration, config.capture, "calibration", "the cameras' calibration", "navigate")
     known = calibration_files.read_for(path, sizes)
     cameras, deep = (known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]), bits if bits > 8 else None
-    if config.rig.bodies:
-        return make_body_tracker(config, cameras, known.uncertainty, deep, SEARCH_S)
-    return make_tracker(config, targets_of(config)[PROBE], cameras, known.uncertainty, deep)
+    return make_rig_tracker(config, targets_of(config), cameras, known.uncertainty, deep, SEARCH_S)
 
 
 def played(config: Config, capture: Path) -> Sources:
