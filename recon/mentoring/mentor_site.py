@@ -29,6 +29,7 @@ from recon.mentoring.posts import Clear, Stroke, Text, Undo
 from recon.mentoring.sightings import Sighting
 from recon.page_server import Answer, Refusal, Request
 from recon.skin_projection.live_picture import seen_from_skin
+from recon.tracking.overlays import brightened
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
@@ -234,11 +235,10 @@ class MentorSite:
 
 
 def encoded(sighting: Sighting, bits: int, drawings: Sequence[Drawing], camera: Camera) -> bytes:
-    """A picture of camera 1 as JPEG, with thin lines where drawings are on the skin, in it."""
+    """A picture of camera 1 as JPEG, brightened, with thin lines where drawings are on the skin, in it."""
     image = sighting.image
     assert image is not None
-    grey = image if bits == 8 else np.uint8(image >> (bits - 8))
-    shown = cv2.cvtColor(np.ascontiguousarray(grey), cv2.COLOR_GRAY2BGR)
+    shown = brightened(image, bits)
     if sighting.world_from_skin is not None:
         device = seen_from_skin(camera, sighting.world_from_skin)
         for drawing in drawings:

@@ -28,7 +28,7 @@ def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Ca
     InputError
         If it isn't an image.
     """
-    picture = _picture(image)
+    picture = brightened(image)
     _draw(picture, view, pose, camera)
     reason = pose.reason if pose is not None else view.reason
     if reason is not None:
@@ -38,13 +38,26 @@ def drawn(image: NDArray, view: View, pose: TargetPose | None = None, camera: Ca
 
 def bodies_drawn(image: NDArray, found: Mapping[str, tuple[View, TargetPose]], camera: Camera) -> NDArray[np.uint8]:
     """The same of several bodies by name, whose views and poses these are; a body without a name has none."""
-    picture, missing = _picture(image), 0
+    picture, missing = brightened(image), 0
     for name, (view, pose) in found.items():
         _draw(picture, view, pose, camera, name)
         if not pose.found:
             _reason(picture, f"{name or 'not found'}: {pose.reason}", missing)
             missing += 1
     return picture
+
+
+def brightened(image: NDArray, bits: int | None = None) -> NDArray[np.uint8]:
+    """A picture : (h, w, 3) BGR of a frame; a dark one is made as bright as people look at it.
+
+    Raises
+    ------
+    InputError
+        If it isn't an image.
+    """
+    values = grey(image, bits)
+    bright = max(float(np.percentile(values[::4, ::4], 99.5)), 1.0)
+    return cv2.cvtColor(cv2.convertScaleAbs(values, alpha=max(FULL / bright, 1.0)), cv2.COLOR_GRAY2BGR)
 
 
 def _draw(picture: NDArray[np.uint8], view: View, pose: TargetPose | None, camera: Camera | None, name: str = "") -> None:
@@ -62,13 +75,6 @@ def _reason(picture: NDArray[np.uint8], text: str, line: int) -> None:
     """A reason at the lower edge, above so many others."""
     high = round(28 * max(picture.shape[1] / 1100, 0.4))
     _text(picture, text, (10, picture.shape[0] - 12 - line * high), BAD, picture.shape[1] - 20)
-
-
-def _picture(image: NDArray) -> NDArray[np.uint8]:
-    values = grey(image).astype(np.float32)
-    bright = max(float(np.percentile(values[::4, ::4], 99.5)), 1.0)
-    shown = np.clip(values * max(FULL / bright, 1.0) if bright < FULL else values, 0, 255).astype(np.uint8)
-    return cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR)
 
 
 def _ring(picture: NDArray[np.uint8], view: View, k: int) -> None:

@@ -11,6 +11,7 @@ from recon import page_server
 from recon.geometry import rigid
 from recon.mentoring import mentor_site, posts
 from recon.mentoring.drawing_log import restore
+from recon.mentoring.sightings import Sighting
 from tests.recon.mentoring import desk
 from tests.recon.skin_projection import skin_shapes
 from tests.recon.web_visitors import answer
@@ -101,11 +102,19 @@ def test_drawings_are_seen_in_the_picture_unless_it_is_plain(desk_at):
         return cv2.imdecode(np.frombuffer(answer(address, f"{ANNA}/picture.jpg{query}")[1], np.uint8), cv2.IMREAD_COLOR)
 
     plain = shown()
-    assert np.abs(plain[256, 320].astype(int) - 90).max() < 3
+    assert np.ptp(plain[256, 320].astype(int)) < 3, "grey"
     post(address, STROKE)
     thin = shown()
-    assert thin[256, 320, 2] > 180 and thin[240, 320, 2] < 110, "yellow on the line"
+    assert thin[256, 320, 2] > thin[256, 320, 0] + 60 and np.ptp(thin[240, 320].astype(int)) < 20, "yellow on the line"
     assert np.abs(shown("?plain").astype(int) - plain).max() < 3
+
+
+@pytest.mark.parametrize(("image", "bits"), [(np.uint8([[3, 60], [0, 12]]), 8), (np.uint16([[48, 960], [0, 192]]), 12)])
+def test_a_dark_film_is_seen_as_bright_as_people_look_at_it(image, bits):
+    """The rig's frames have their white at 60 of 255: ratios of brightness stay, and so does black."""
+    sighting = Sighting(3, 0, np.kron(image, np.ones((32, 32), image.dtype)), None)
+    shown = cv2.imdecode(np.frombuffer(mentor_site.encoded(sighting, bits, (), desk.camera()), np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_allclose(shown[16::32, 16::32], [[11, 220], [0, 44]], atol=3)
 
 
 @pytest.mark.parametrize(("what", "complaint"), [
