@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import re
 import traceback
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -166,7 +166,7 @@ def _read(path: Path) -> list[Outcome]:
 
 
 def table(found: Sequence[Outcome]) -> list[str]:
-    """Lines of Markdown: a row a verb, then those that were wrong without a word."""
+    """Lines of Markdown: a row a verb, then those that were wrong without a word, by the number of times."""
     by_verb: Mapping[str, list[Outcome]] = defaultdict(list)
     for one in found:
         by_verb[one.verb].append(one)
@@ -175,13 +175,6 @@ def table(found: Sequence[Outcome]) -> list[str]:
     for verb, some in [*sorted(by_verb.items()), ("all", list(found))]:
         counts = [sum(one.outcome == kind for one in some) for kind in KINDS]
         lines.append(f"| {verb} | {len(some)} | {' | '.join(map(str, counts))} |")
-    silent: Mapping[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for one in found:
-        if one.outcome == "silently wrong":
-            silent[one.kind, one.what][one.verb].append(one.sigma)
-    lines += ["", "| wrong without a word | kind | verbs, with the number of times | off, sigma, in each |", "|---|---|---|---|"]
-    for (kind, what), verbs in sorted(silent.items()):
-        times = ", ".join(f"{verb} {len(sigmas)}" for verb, sigmas in sorted(verbs.items()))
-        off = ", ".join(f"{np.median(sigmas):.3g}" for _, sigmas in sorted(verbs.items()))
-        lines.append(f"| {what} | {kind} | {times} | {off} |")
-    return lines
+    silent = Counter(one.what for one in found if one.outcome == "silently wrong")
+    words = ", ".join(f"{what} {count}" for what, count in sorted(silent.items()))
+    return [*lines, "", f"Wrong without a word: {words or 'none'}."]

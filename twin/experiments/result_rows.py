@@ -235,10 +235,17 @@ def _line(choice: Chosen, row: Row | None, count: int) -> str:
 
 
 def whole_table(rows: Sequence[Row], limit: str) -> str:
-    """All rows as a Markdown table; `limit` heads the column of what they are compared with."""
-    lines = [f"| what | measured | bar | {limit} | unit | ok |", "|---|---|---|---|---|---|"]
+    """All rows as a Markdown table; `limit` heads the column of what they are compared with.
+
+    A dash stands for words before a colon that are those of the row above.
+    """
+    lines = [f"| what | measured | bar | {limit} | ok |", "|---|---|---|---|---|"]
+    above = ""
     for row in rows:
+        about, _, figure = row.what.rpartition(": ")
+        what, above = f"– {figure}" if about and about == above else row.what, about
+        measured = f"{row.measured:.4g} {row.unit}".strip()
         beside = "" if row.limit is None else f"{row.limit:.4g}"
         met = {None: "", True: "yes", False: "**no**"}[row.met]
-        lines.append(f"| {row.what} | {row.measured:.4g} | {row.asked} | {beside} | {row.unit} | {met} |")
+        lines.append(f"| {what} | {measured} | {row.asked} | {beside} | {met} |")
     return "\n".join(lines)

@@ -155,4 +155,4 @@ def _middle(values: NDArray[np.float64]) -> float:
 def _spread(values: NDArray[np.float64]) -> str:
     if not values.size:
         return ""
-    return f"{values.mean():.3f} ({values.min():.3f} to {values.max():.3f}; {values.size})"
+    return f"{values.mean():.3f} ({values.min():.3f}–{values.max():.3f}; {values.size})"

@@ -90,11 +90,18 @@ def test_a_tidy_table_keeps_all_digits_and_other_groups(tmp_path):
 def test_a_whole_table_has_bars_in_both_directions():
     """Of some nothing is asked, and no number meets no bar."""
     assert result_rows.whole_table(ROWS, "peer").splitlines()[2:] == [
-        '| an error, "quoted" (paper: 0.1 to 0.2) | 0.0123 | <= 0.05 | 0.01 | mm | yes |',
-        "| a share | 0.9 | >= 0.97 |  |  | **no** |",
-        "| nothing found | nan | <= 1 | nan | px | **no** |",
-        "| the peer's | 9.123e+04 |  | 0 | ms |  |",
+        '| an error, "quoted" (paper: 0.1 to 0.2) | 0.0123 mm | <= 0.05 | 0.01 | yes |',
+        "| a share | 0.9 | >= 0.97 |  | **no** |",
+        "| nothing found | nan px | <= 1 | nan | **no** |",
+        "| the peer's | 9.123e+04 ms |  | 0 |  |",
     ]
+
+
+def test_words_before_a_colon_stand_once():
+    """In rows that follow one another; of two colons the last one counts."""
+    rows = [replace(ROWS[1], what=what) for what in ("a: b: one", "a: b: two", "a: two", "two", "three", "a: four")]
+    cells = [line.split(" | ")[0] for line in result_rows.whole_table(rows, "peer").splitlines()[2:]]
+    assert cells == ["| a: b: one", "| – two", "| a: two", "| two", "| three", "| a: four"]
 
 
 def test_the_worst_row_stands_for_its_choice():

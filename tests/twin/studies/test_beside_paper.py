@@ -40,9 +40,9 @@ def test_each_figure_stands_under_each_point():
 def test_cells_have_means_and_in_brackets_the_range_and_the_trials():
     planes, _, radius, _ = map(beside_paper.cells, beside_paper.compare([PLANES, RADIUS], DONE))
     assert planes == [
-        "ideal", "planes, RMS", "0.1 to 0.13", "0.120 (0.110 to 0.130; 2)", "yes", "0.040 (0.030 to 0.050; 2)", "0.03", "", "mm"
+        "ideal", "planes, RMS", "0.1 to 0.13", "0.120 (0.110–0.130; 2)", "yes", "0.040 (0.030–0.050; 2)", "0.03", "", "mm"
     ]  # fmt: skip
-    assert radius == ["ideal", "radius error", "0.045", "", "no", "0.020 (0.010 to 0.030; 2)", "", "", "mm"]
+    assert radius == ["ideal", "radius error", "0.045", "", "no", "0.020 (0.010–0.030; 2)", "", "", "mm"]
     assert len(planes) == len(beside_paper.HEAD)
 
 
@@ -89,7 +89,7 @@ def test_a_missing_figure_misses_its_bar():
 def test_a_figure_that_the_paper_lacks_is_neither_met_nor_missed():
     (only,) = beside_paper.compare([Figure(what="volumes", paper="paper_mm", ours="ours_mm", unit="mm")], DONE[:1])
     assert only.paper_met is None
-    assert beside_paper.cells(only)[2:6] == ["none", "0.110 (0.110 to 0.110; 1)", "", "0.030 (0.030 to 0.030; 1)"]
+    assert beside_paper.cells(only)[2:6] == ["none", "0.110 (0.110–0.110; 1)", "", "0.030 (0.030–0.030; 1)"]
 
 
 def test_a_table_in_markdown_has_a_row_a_figure_and_point():
