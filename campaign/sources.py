@@ -306,7 +306,7 @@ def _write_tool(folder: Path) -> None:
     mesh = trimesh.creation.cone(1.0, length, sections=6).apply_transform(np.diag([1.0, -1, -1, 1]))
     for suffix in (".stl", ".glb"):
         mesh.export(folder / f"needle{suffix}")
-    tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis))
+    tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis, body="needle"))
 
 
 def _pairs(folder: Path, noise_px: float = 0.0) -> str:

@@ -1,8 +1,9 @@
 """Files of a tool's tip, `tip.yaml`: OpenCV FileStorage YAML.
 
-`schema`; `tip_mm` in the target's frame; of a film `dimple_mm` in the world, `rms_mm` and `frames`; `axis`, the shaft's direction
-in the target's frame from the handle to the tip, where it is known; `model`, a mesh's path relative to the file, where there is
-one; and `parameters`, names of the numbers of `tip_mm`, `dimple_mm` and `axis`, with their `covariance`.
+`schema`; `body`, the name of the rig's body, where it has one; `tip_mm` in the target's frame; of a film `dimple_mm` in the
+world, `rms_mm` and `frames`; `axis`, the shaft's direction in the target's frame from the handle to the tip, where it is known;
+`model`, a mesh's path relative to the file, where there is one; and `parameters`, names of the numbers of `tip_mm`, `dimple_mm`
+and `axis`, with their `covariance`.
 """
 
 import os
@@ -31,6 +32,8 @@ def write(path: Path, tip: Tip, out: Path | None = None) -> None:
     """
     storage = cv2.FileStorage(".yaml", cv2.FileStorage_WRITE | cv2.FileStorage_MEMORY)
     storage.write("schema", SCHEMA)
+    if tip.body:
+        storage.write("body", tip.body)
     storage.write("tip_mm", np.reshape(tip.tip_mm, (1, 3)))
     for name, vector in (("axis", tip.axis), ("dimple_mm", tip.dimple_mm)):
         if vector is not None:
@@ -44,15 +47,23 @@ def write(path: Path, tip: Tip, out: Path | None = None) -> None:
     opencv_storage.save(path, storage)
 
 
-def read(path: Path) -> Tip:
+def read(path: Path, body: str = "") -> Tip:
     """Read a tip.
+
+    body : that it is expected to be of; a file without a name is taken, as older ones are
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, of another kind, or a value is missing or can't be.
+        If the file is missing, damaged, of another kind or another body, or a value is missing or can't be.
     """
     values = opencv_storage.read_schema(path, "a tool's tip", SCHEMA)
+    named = values.get("body", "")
+    if not isinstance(named, str):
+        raise InputError(f"{path}: body: expected a name of rig.bodies, found {brief(named)}")
+    if body and named and named != body:
+        way = f"another tool's file? calibrate-tip writes the name that its body= has, body={body}"
+        raise InputError(f"{path}: body: expected the tip of {body}, found that of {short(named)}: {way}")
     tip = _vector(path, values, "tip_mm")
     axis, dimple = (_vector(path, values, name) if name in values else None for name in ("axis", "dimple_mm"))
     if axis is not None and abs(np.linalg.norm(axis) - 1) > OFF_LENGTH:
@@ -67,7 +78,7 @@ def read(path: Path) -> Tip:
         raise InputError(f"{path}: parameters: expected {' '.join(shape.parameters)}, as of what the file holds, found {found}")
     covariance = opencv_storage.covariance(path, values, len(shape.parameters))
     of_film = (float(rms), int(frames)) if dimple is not None else (np.nan, 0)
-    return Tip(tip, covariance, axis, dimple, *of_film, None if model is None else path.parent / model)
+    return Tip(tip, covariance, axis, dimple, *of_film, None if model is None else path.parent / model, named)
 
 
 def _vector(path: Path, values: Values, name: str) -> Array:

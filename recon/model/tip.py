@@ -22,6 +22,7 @@ class Tip:
     rms_mm: float = np.nan  # distance of the tip from the dimple; NaN of a drawing's
     frames: int = 0  # of which the tip was found
     model: Path | None = None  # mesh of the tool, mm in the target's frame
+    body: str = ""  # of the rig, that carries the target; empty where it has no name
 
     @property
     def parameters(self) -> tuple[str, ...]:

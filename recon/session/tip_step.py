@@ -49,7 +49,8 @@ class Settings(Demands, MeasuredTargetFields):
     sweep: str = ""
     """name of the sweep with these frames, of a capture that holds several"""
     body: str = PROBE
-    """which body of the rig the tool is: probe, or a name in rig.bodies; `target` is its measured target then"""
+    """which body of the rig the tool is: probe, or a name in rig.bodies, which tip.yaml gets; `target` is its measured target
+    then"""
     track: Path | None = None
     """a table of the target's poses, as `sonotwin track` writes it: poses.csv. Or else:"""
     sequence: Path | None = None
@@ -86,6 +87,12 @@ class Settings(Demands, MeasuredTargetFields):
         if self.axis is not None and not np.linalg.norm(self.axis) > 0:
             raise ValueError("axis: expected a direction, found zeros")
         return self
+
+    @property
+    def named_body(self) -> str:
+        """The body's name; empty of a rig with one target, whatever carries it, and of poses whose body isn't named."""
+        several = self.capture is not None and bool(self.rig.bodies)
+        return self.body if several or self.body != PROBE else ""
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> Calibrated:
     atomic.check_folder(out, BY, inputs=(*sources, settings.target, settings.networks))
     mesh = None if settings.model is None else meshes.read_model(settings.model, "a model of the tool")
     made = by_drawing(settings) if settings.tip_mm is not None else by_film(settings, watch)
-    made = with_axis(made, settings, watch)
+    made = with_axis(replace(made, tip=replace(made.tip, body=settings.named_body)), settings, watch)
     if settings.model is not None and mesh is not None:
         away = model_check.check(settings.model, mesh, made.tip.tip_mm, made.figures["sigma_mm"])
         watch.say(f"model       the tip is {away:.2f} mm from its surface")

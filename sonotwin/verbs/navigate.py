@@ -198,7 +198,7 @@ def tools_of(config: Config) -> dict[str, Tip | None]:
         if name not in names:
             expected = f"a tool of rig.bodies, {', '.join(names)}" if names else "none, as rig.bodies names no tool"
             raise InputError(f"tips.{name}: expected {expected}, found {path}{did_you_mean(name, names)}")
-    return {name: tip_files.read(config.tips[name]) if name in config.tips else None for name in names}
+    return {name: tip_files.read(config.tips[name], name) if name in config.tips else None for name in names}
 
 
 def reference_of(config: Config) -> Track | None:

@@ -102,6 +102,13 @@ def test_a_drawing_will_do(tmp_path, capsys):
     assert sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) == ["metrics.json", "tip.yaml"]
 
 
+def test_the_body_is_named_where_it_has_a_name(table, tmp_path):
+    """Of a table's poses nothing but `body` has the name; a rig with one target has none."""
+    for given, name in (["rig=three_bodies", "body=needle"], "needle"), (["rig=three_bodies"], ""), ([], ""):
+        assert main(["calibrate-tip", f"track={table}", *given, f"out={tmp_path / 'tip'}"]) == 0
+        assert tip_files.read(tmp_path / "tip" / "tip.yaml").body == name
+
+
 def test_an_axis_that_points_away_from_the_tip_is_said(tmp_path, capsys):
     for axis, said in (("[0,0,1]", True), ("[0,0.5,-1]", False)):
         assert main(["calibrate-tip", "tip_mm=[0,-2.5,-150]", f"axis={axis}", f"out={tmp_path / 'tip'}"]) == 0

@@ -3,6 +3,7 @@
 import csv
 import re
 import socket
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from time import monotonic
@@ -174,6 +175,9 @@ def test_what_is_wrong_with_tools_is_said_in_one_line(complaint, tmp_path):
     assert complaint(three, "tips.patient=a.yaml").startswith("tips.patient: expected a tool of rig.bodies, needle, found")
     assert complaint("tips.needle=a.yaml") == "tips.needle: expected none, as rig.bodies names no tool, found a.yaml"
     assert complaint(three, f"tips.needle={tmp_path / 'a.yaml'}").startswith(f"{tmp_path / 'a.yaml'}: expected")
+    tip_files.write(tmp_path / "stylus.yaml", replace(TIP, body="stylus"))
+    expected = f"{tmp_path / 'stylus.yaml'}: body: expected the tip of needle, found that of stylus: another tool's file?"
+    assert complaint(three, f"tips.needle={tmp_path / 'stylus.yaml'}").startswith(expected)
     assert complaint("measured.needle=a.yaml").startswith("measured.needle: expected none, as rig.bodies names none")
     apart = "navigate: plan: expected an entry and an aim 1 to 1000 mm apart, found"
     assert complaint("plan=[[0,0,600],[0,0,600]]") == f"{apart} 0 mm"

@@ -1,6 +1,7 @@
 """A tip survives its file, and a bad file is refused in one line."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,14 @@ def covariance(count, rng):
 @pytest.fixture
 def tip(rng, tmp_path) -> Tip:
     return Tip(
-        FOUND, covariance(9, rng), np.array([0.0, 0.6, -0.8]), np.array([10.0, 20, 700]), 0.06, 198, tmp_path / "needle.stl"
+        FOUND,
+        covariance(9, rng),
+        np.array([0.0, 0.6, -0.8]),
+        np.array([10.0, 20, 700]),
+        0.06,
+        198,
+        tmp_path / "needle.stl",
+        "needle",
     )
 
 
@@ -34,7 +42,7 @@ def test_what_is_written_is_read(tip, written):
     back = tip_files.read(written)
     for name in ("tip_mm", "axis", "dimple_mm", "covariance"):
         np.testing.assert_allclose(getattr(back, name), getattr(tip, name), rtol=1e-12)
-    assert (back.rms_mm, back.frames, back.model) == (0.06, 198, tip.model)
+    assert (back.rms_mm, back.frames, back.model, back.body) == (0.06, 198, tip.model, "needle")
     assert back.parameters == (*TIP, *DIMPLE, *AXIS)
     np.testing.assert_allclose(back.covariance_of(AXIS), tip.covariance[6:, 6:])
 
@@ -43,6 +51,14 @@ def test_a_drawings_tip_has_neither_dimple_nor_frames(rng, tmp_path):
     tip_files.write(tmp_path / "tip.yaml", Tip(FOUND, covariance(3, rng)))
     back = tip_files.read(tmp_path / "tip.yaml")
     assert back.axis is None and back.dimple_mm is None and back.model is None and np.isnan(back.rms_mm) and back.frames == 0
+
+
+def test_another_bodys_tip_is_refused_and_one_without_a_name_is_taken(tip, written):
+    assert tip_files.read(written, "needle").body == "needle"
+    with pytest.raises(InputError, match="body: expected the tip of stylus, found that of needle: another tool"):
+        tip_files.read(written, "stylus")
+    tip_files.write(written, replace(tip, body=""))
+    assert "body" not in written.read_text() and tip_files.read(written, "stylus").body == ""
 
 
 def test_the_models_path_holds_from_where_the_file_goes(tip, tmp_path):
@@ -57,6 +73,7 @@ def test_the_models_path_holds_from_where_the_file_goes(tip, tmp_path):
     [
         ("sonotwin-tip/1", "sonotwin-tip/9", "schema: expected sonotwin-tip/1, found sonotwin-tip/9"),
         ("tip_mm:", "tips_mm:", "tip_mm: expected a matrix, found none"),
+        ("body: needle", "body: 7", "body: expected a name of rig.bodies, found 7"),
         ("-2.25", ".Nan", "tip_mm: expected three finite numbers"),
         ("-0.8", "-0.9", "axis: expected a direction of length 1, found one of 1.08"),
         ("rms_mm: 0", "rms_mm: -0", "rms_mm: expected a number from 0 on"),
