@@ -36,7 +36,8 @@ OF_SOME_VERBS = {  # choices of a group that only these verbs take
     "devices/virtual": ("record",),
     **dict.fromkeys(("path/hand", "path/pivot"), ("film",)),
     **dict.fromkeys(
-        ("path/bob", "path/none", "path/raster", "path/rows", "path/stroke", "path/wire"), ("demo", "record", "sweep")
+        ("path/bob", "path/hold", "path/none", "path/raster", "path/rows", "path/stroke", "path/wire"),
+        ("demo", "record", "sweep"),
     ),
 }
 NEEDED = "???"  # Hydra's mark of a field that needs a value

@@ -1,6 +1,6 @@
 """A freehand sweep of a scene that both cameras may film: its settings, the probe's way, its B-scans, and the cameras' frames."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,11 +8,14 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from recon.capture.manifest import SweepNameOrNone
-from recon.model.rig import Part, Rig
+from recon.model.rig import Rig
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
+from twin import swept_bodies
 from twin.conditions import Conditions, drifted, printed
 from twin.shooting import FrameShooting
+from twin.swept_bodies import SweptBody
+from twin.tracking.led_bodies import LedBodies, check_names
 from twin.tracking.sampling_ranges import DataRanges
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan, scans
@@ -27,7 +30,7 @@ if TYPE_CHECKING:
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
 
 
-class SweepSettings(Part):
+class SweepSettings(LedBodies):
     """All that a sweep is made from; as in `conf/sweep.yaml`."""
 
     rig: Rig
@@ -62,6 +65,11 @@ class SweepSettings(Part):
             raise ValueError(f"seed: expected less than 2^32 with filmed=true, found {self.seed}")
         return self
 
+    @model_validator(mode="after")
+    def _of_the_rig(self) -> "SweepSettings":
+        check_names(self.bodies, self.rig)
+        return self
+
     @field_validator("path", mode="before")
     @classmethod
     def _leads_somewhere(cls, value: object) -> object:
@@ -83,6 +91,7 @@ class PlannedSweep:
     scene: Scene
     scanned: Body  # the scene by sound
     plan: Plan
+    bodies: Mapping[str, SweptBody]  # of the rig, besides the probe
 
     def scans(self) -> Iterator[Scan]:
         """Render the B-scans, one by one."""
@@ -115,12 +124,12 @@ class PlannedSweep:
 
 
 def plan_sweep(settings: SweepSettings) -> PlannedSweep:
-    """Set up the scene, and lead the probe along its path.
+    """Set up the scene, and lead the probe and all further bodies along their paths.
 
     Raises
     ------
     InputError
-        As `twin.ultrasound.sweep_session.plan_sweep`, or if the scene has no acoustics.
+        As `twin.ultrasound.sweep_session.plan_sweep` and `twin.swept_bodies.lead`, or if the scene has no acoustics.
     """
     scene = build_scene(settings.scene)
     scanned = at_speeds(body(scene), settings.conditions.sound, settings.seed)
@@ -134,4 +143,7 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
         settings.own_seed,
         settings.conditions.motion,
     )
-    return PlannedSweep(settings, scene, scanned, plan)
+    bodies = swept_bodies.lead(
+        settings, settings.rig, settings.ultrasound, plan, settings.pose_noise, settings.own_seed, settings.conditions.motion
+    )
+    return PlannedSweep(settings, scene, scanned, plan, bodies)

@@ -24,6 +24,7 @@ MANIFEST = "manifest.json"
 OPTICS = "calibration/optics.yaml"
 PROBE = "calibration/probe.yaml"
 TRACK = "track.csv"  # in the folder of a sweep
+BODIES, POSES = "bodies", "poses.csv"  # folder of further bodies, each in a folder of its name with its table of poses
 STAMPS = "timestamps.csv"  # in each device's folder of a sweep
 CAMERAS = ("cam1", "cam2")
 SCANNER = "us"
@@ -150,12 +151,14 @@ class SweepPart(Part):
     purpose: Purpose | None = None
     images: Annotated[dict[str, Inside], Field(min_length=1)]  # device: folder of its images and timestamps.csv
     track: str | None = None  # path of the poses; none if they are still to be found in the cameras' images
+    bodies: dict[rig.BodyName, str] | None = None  # paths of the poses of further bodies, such as a needle
 
     def paths(self) -> Iterator[str]:
         """All paths that are named."""
         yield from self.images.values()
         if self.track is not None:
             yield self.track
+        yield from (self.bodies or {}).values()
 
 
 class SweepImages(NamedTuple):
@@ -326,6 +329,11 @@ class Manifest(rig.Part):
 def sweep_part(name: str) -> PartName:
     """The part that is the sweep of a name."""
     return f"{SWEEP}/{name}" if name else SWEEP
+
+
+def body_track(part: PartName, body: str) -> str:
+    """Where a capture holds the poses of a further body in a sweep."""
+    return f"{part}/{BODIES}/{body}/{POSES}"
 
 
 def is_sweep(part: PartName) -> bool:

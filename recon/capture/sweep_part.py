@@ -3,8 +3,8 @@
 B-scans are read one at a time: a sweep of some minutes is larger than it needs to be in memory.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ class SweepCapture:
     track: Track  # of the target, of the tracker's clock
     probe: ProbeCalibration | None = None
     left_out: int = 0  # poses that no hand makes, which the track has no longer
+    bodies: Mapping[str, Track] = field(default_factory=dict)  # of further bodies, such as a needle, by the tracker's clock
 
     @property
     def clocked(self) -> bool:
@@ -114,12 +115,12 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None, imp
     read = manifest.read_manifest(folder)
     place, part = read.sweep_of(folder / MANIFEST, "B-scans and the poses of the probe", name, purpose)
     root, entry = folder / read.root, manifest.field_of(place)
-    for field, found, way in (
+    for key, found, way in (
         (f"images.{SCANNER}", part.images.get(SCANNER), ""),
         ("track", part.track, "; find the poses by `sonotwin track` first, and give its folder as the capture"),
     ):
         if found is None:
-            raise InputError(f"{folder / MANIFEST}: {entry}.{field}: expected a path, found none{way}")
+            raise InputError(f"{folder / MANIFEST}: {entry}.{key}: expected a path, found none{way}")
     device = read.devices_of(place)[SCANNER]
     if device.bits != 8:
         raise InputError(f"{folder / MANIFEST}: devices.{SCANNER}.bits: expected 8, found {device.bits}")
@@ -130,7 +131,8 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None, imp
     listed = root / str(part.track)
     track, left_out = _believed(listed, sweep_tables.read_track(listed), paths, times, device.size, implausible)
     probe = None if read.probe is None else probe_files.read(folder / read.probe)
-    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe, left_out)
+    bodies = {body: sweep_tables.read_track(root / path) for body, path in (part.bodies or {}).items()}
+    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe, left_out, bodies)
 
 
 def _believed(

@@ -128,6 +128,7 @@ class CaptureWriter:
         track: Track | None = None,
         name: str = "",
         purpose: Purpose | None = None,
+        bodies: Mapping[str, Track] | None = None,
     ) -> None:
         """Write B-scans, frames of the tracking cameras, or both, each device's with its own time stamps.
 
@@ -139,6 +140,7 @@ class CaptureWriter:
             Taken one by one; those of a device in the order of its times, the devices in any order.
         track : poses of the probe's target; None where they are still to be found in the cameras' frames
         name : of one of several sweeps; of the only one none is needed
+        bodies : poses of further bodies by their names, by the clock of the track
 
         Raises
         ------
@@ -151,7 +153,9 @@ class CaptureWriter:
                 raise ValueError("times: expected them strictly increasing")
         place = manifest.sweep_part(name)
         poses = None if track is None else f"{place}/{manifest.TRACK}"
-        part = SweepPart(purpose=purpose, images={device: f"{place}/{device}" for device in times}, track=poses)
+        others = {body: manifest.body_track(place, body) for body in bodies or {}}
+        folders = {device: f"{place}/{device}" for device in times}
+        part = SweepPart(purpose=purpose, images=folders, track=poses, bodies=others or None)
         self._add(place, part, devices)
         counts = dict.fromkeys(times, 0)
         for device, image in images:
@@ -164,6 +168,9 @@ class CaptureWriter:
             sweep_tables.write_stamps(self.folder / part.images[device] / manifest.STAMPS, moments)
         if track is not None:
             sweep_tables.write_track(self.folder / place / manifest.TRACK, track)
+        for body, path in others.items():
+            (self.folder / path).parent.mkdir(parents=True)
+            sweep_tables.write_track(self.folder / path, bodies[body])
 
     def finish(self) -> None:
         """Write the manifest."""

@@ -20,8 +20,8 @@ from recon.tracking.tracker import Tracking
 
 Array = NDArray[np.float64]
 
-POSES, FRAMES, OVERLAYS = "poses.csv", "frames.csv", "overlays"
-BODIES = "bodies"  # folder of the same tables of further bodies, each in a folder of its name
+POSES, FRAMES, OVERLAYS = manifest.POSES, "frames.csv", "overlays"
+BODIES = manifest.BODIES  # folder of the same tables of further bodies, each in a folder of its name
 COLUMNS = (
     "time_ns", "frame_cam1", "frame_cam2", "found", "how", "sigma_mm", "sigma_deg", "shared_mm", "shared_deg", "blur_px_cam1",
     "blur_px_cam2", "reason",
@@ -115,7 +115,7 @@ def overlay_name(number: int) -> str:
 
 
 def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None, sweep: str = "") -> bool:
-    """Make a folder of poses a capture: the one that they were found in, with them as its track. Only if it has B-scans.
+    """Make a folder of poses a capture: the one that they were found in, with them as its tracks. Only if it has B-scans.
 
     Parameters
     ----------
@@ -134,7 +134,11 @@ def hand_on(folder: Path, source: Path, out: Path, optics: Path | None = None, s
     files = {name: os.path.relpath(source / path, out) for name in ("calibration", "probe") if (path := getattr(read, name))}
     if optics is not None:
         files["calibration"] = os.path.relpath(optics.resolve(), out)
-    tracked = part.model_copy(update={"track": os.path.relpath(out / POSES, root)})
+    bodies = {
+        path.parent.name: os.path.relpath(out / path.relative_to(folder), root)
+        for path in sorted((folder / BODIES).glob(f"*/{POSES}"))
+    }
+    tracked = part.model_copy(update={"track": os.path.relpath(out / POSES, root), "bodies": bodies or None})
     own = place.partition("/")[2]
     parts = {"sweeps": {own: tracked}} if own else {"sweep": tracked}
     manifest.write_manifest(folder, read.model_copy(update={"root": os.path.relpath(root, out), **parts, **files}))

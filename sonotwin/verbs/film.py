@@ -30,6 +30,7 @@ from twin.conditions import Conditions, drifted, printed
 from twin.session import Session
 from twin.shooting import FilmQuality
 from twin.tracking import film_session
+from twin.tracking.led_bodies import check_names
 from twin.tracking.rendered_views import Frames
 from twin.tracking.sampling_ranges import DataRanges
 
@@ -48,9 +49,7 @@ class Config(film_session.Filming):
 
     @model_validator(mode="after")
     def _of_the_rig(self) -> Self:
-        if unknown := [name for name in self.bodies if name not in self.rig.bodies]:
-            there = ", ".join(self.rig.bodies) or "none, such as rig=three_bodies has"
-            raise ValueError(f"bodies: expected names of the rig's further bodies ({there}), found {', '.join(unknown)}")
+        check_names(self.bodies, self.rig)
         return self
 
 

@@ -32,7 +32,8 @@ from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan
-from twin.ultrasound.probe_path import Bob, RowPath, SurfacePath, WirePath
+from twin.ultrasound.probe_path import RowPath, SurfacePath, WirePath
+from twin.ultrasound.sweep_session import AnyPath
 
 if TYPE_CHECKING:
     from twin.tracking.rendered_views import Frames
@@ -68,7 +69,15 @@ def run(config: Config) -> None:
     probe = None if isinstance(config.path, WirePath | RowPath) else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
     sweep_session.write_session(
-        session, planned.scene, planned.scanned, config.ultrasound, planned.plan, shown(planned, console), probe, film
+        session,
+        planned.scene,
+        planned.scanned,
+        config.ultrasound,
+        planned.plan,
+        shown(planned, console),
+        probe,
+        film,
+        planned.bodies,
     )
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size
@@ -94,7 +103,7 @@ def shown(planned: PlannedSweep, console: Console) -> Iterator[Scan]:
         yield from progress.track(planned.scans(), total=len(planned.plan.times), description="rendering B-scans")
 
 
-def led_along(path: SurfacePath | Bob | WirePath | RowPath) -> str:
+def led_along(path: AnyPath) -> str:
     """How the probe is led, for the console; a raster is several strokes."""
     if isinstance(path, SurfacePath):
         return f"{path.strokes} strokes side by side" if path.strokes > 1 else "1 stroke"

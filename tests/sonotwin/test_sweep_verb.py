@@ -135,13 +135,21 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
             ["scene=cylinders", "path.surface=inner", "path.start_mm=[0,-2]", "path.end_mm=[2,-2]"],
             "path: expected the probe in front of all things, found it in outer after 0.00 s",
         ),
-        (["path=wires"], "path: expected one of bob, none, raster, rows, stroke, wire, found wires; did you mean wire?"),
-        (["path.kind=fly"], "path.kind: expected one of 'stroke', 'bob', 'wire', 'rows', found 'fly'"),
+        (["path=wires"], "path: expected one of bob, hold, none, raster, rows, stroke, wire, found wires; did you mean wire?"),
+        (["path.kind=fly"], "path.kind: expected one of 'stroke', 'hold', 'bob', 'wire', 'rows', found 'fly'"),
         (["path.speed_mm_s=0"], "speed_mm_s: expected greater than 0, found 0"),
         (["ultrasound.image_size=[96,96]"], "ultrasound.image_size: expected rig.probe's [321, 408], found [96, 96]"),
         (["clocks.scanner_hz=0"], "clocks.scanner_hz: expected greater than 0, found 0"),
         (["pose_noise.turn_deg=-1"], "pose_noise.turn_deg: expected greater than or equal to 0, found -1"),
         (["seed=-1"], "seed: expected greater than or equal to 0, found -1"),
+        (
+            ["bodies.needle={look: {kind: needle}}"],
+            "bodies: expected names of the rig's further bodies (none, such as rig=three_bodies has)",
+        ),
+        (
+            ["rig=three_bodies", "bodies.patient={path: {kind: insertion}}"],
+            "bodies.patient.path.kind: expected insertion for a body with a tip, such as a needle",
+        ),
     ],
 )
 def test_nonsense_is_refused_by_name(arguments, complaint, tmp_path, capsys):

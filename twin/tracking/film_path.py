@@ -6,6 +6,7 @@ A kind of path is a module of `twin.tracking.film_paths`, found by its name, wit
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,13 @@ class Way:
         return Motion(self.pose(seconds), speed * exposure_s, spin * exposure_s)
 
 
+class Aimed(NamedTuple):
+    """What a tool is led by besides its target."""
+
+    line_mm: Array | None  # (2, 3) from the shaft's rear end to the tip, in the target's frame; None of a body without a tip
+    world_from_face: Array  # (4, 4) mm: the middle of the array's face, x along it, y into the depth
+
+
 class FilmPath(Kinds):
     """A closed round of the target."""
 
@@ -61,11 +69,20 @@ class FilmPath(Kinds):
     USUAL = "hand"
 
     @abstractmethod
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
+    def lead(
+        self,
+        target: Target,
+        eyes: Array,
+        seed: int,
+        errors: conditions.Motion = STILL,
+        body: Sequence[int] = (),
+        aimed: Aimed | None = None,
+    ) -> Way:
         """Lead the target along the path, its face to the point between the cameras : (3,) mm.
 
         errors : of which the tremor is added.
         body : its number, of one besides the probe
+        aimed : of one besides the probe
         """
 
     @property

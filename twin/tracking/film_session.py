@@ -17,8 +17,8 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.calibration import Calibration
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import PROBE, BodyName, Part, Positive, Rig, Target
-from scenes.handheld.body_look import Look, Stand, look_of
+from recon.model.rig import PROBE, Positive, Rig, Target
+from scenes.handheld.body_look import Stand
 from scenes.handheld.handheld_assembly import held
 from scenes.handheld.surroundings import surroundings
 from scenes.scene_types import Scene
@@ -26,7 +26,7 @@ from twin import conditions
 from twin.session import Session, describe
 from twin.shooting import FilmQuality, Quality, Shooting
 from twin.tracking.film_path import STILL, FilmPath, Way
-from twin.tracking.film_paths import hand
+from twin.tracking.led_bodies import LedBodies
 from twin.tracking.mesh_bank import Bank, bank_of, build_bank, uncovered, uncovered_share
 from twin.tracking.rendered_views import Frames, Views, render_film, render_full, white_radiance
 from twin.tracking.samples import Held, Motion, Take, draw
@@ -46,37 +46,18 @@ TABLE_MM = 40.0  # a needle's tip may reach past the probe's path: what surround
 Seen = Mapping[str, Views]  # truth of a pair by bodies' names
 
 
-# of bodies that no path is given for, beside the probe's usual one: the first above, the second below, facing the cameras
-PLACES_MM = ((70.0, -46.0, 660.0), (76.0, 46.0, 668.0))
-ROLLS_DEG = (75.0, 20.0)
-BREATH_MM, BREATH_S, SWAY_MM = 1.5, 4.0, 12.0  # by which a body on a post moves, in what time, and by which a hand does
-
-
-class FilmedBody(Part):
-    """Look and path of a body besides the probe."""
-
-    look: Look | None = None  # that of its name if there is one, or a board on a post
-    path: FilmPath | None = None  # beside the probe's usual one
-
-
-class Filming(Shooting):
+class Filming(Shooting, LedBodies):
     """Settings of a film."""
 
     frames: Annotated[int, Field(ge=1, le=100_000)] = 30
     camera_hz: Positive = 30.0
     path: FilmPath
-    bodies: dict[BodyName, FilmedBody] = Field(default_factory=dict)  # besides the probe, of those that the rig has
 
     @model_validator(mode="after")
     def _one_after_the_other(self) -> "Filming":
         if self.exposure_s * self.camera_hz > 1:
             raise ValueError(f"exposure_s: expected at most 1 / camera_hz = {1 / self.camera_hz:.4g}, found {self.exposure_s:g}")
         return self
-
-    def look(self, name: str) -> Look:
-        """Look of a body besides the probe."""
-        given = self.bodies.get(name)
-        return look_of(name) if given is None or given.look is None else given.look
 
     @property
     def times(self) -> NDArray[np.int64]:
@@ -121,10 +102,11 @@ def set_stage(rig: Rig, ranges: DataRanges, filming: Filming, seed: int, errors:
     cameras = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
     eyes = (cameras[0].centre + cameras[1].centre) / 2
     ways, farthest = {PROBE: filming.path.lead(rig.target, eyes, seed, errors)}, filming.path.room_mm
-    for number, (name, target) in enumerate(rig.bodies.items(), 1):
-        look, given = filming.look(name), filming.bodies.get(name, FilmedBody())
-        path = given.path or _beside(name, number - 1, look)
-        ways[name] = path.lead(target, eyes, seed, errors if look.IN_A_HAND else STILL, [number])
+    width_mm = rig.probe.scale_mm_per_px[0] * (rig.probe.image_size[0] - 1)
+    face = ways[PROBE].pose(0.0) @ rig.probe.target_from_image.matrix() @ rigid.transform(np.eye(3), [width_mm / 2, 0, 0])
+    for number, (name, target) in enumerate(rig.bodies.items()):
+        look, path = filming.look(name), filming.path_of(name, number)
+        ways[name] = filming.lead(name, path, rig, face, seed, errors)
         tip = look.tip_mm(target)
         reach = 0.0 if tip is None else rigid.apply(ways[name].pose(0.0), tip)[2] - TABLE_MM
         farthest[2] = max(farthest[2], path.room_mm[2], reach)
@@ -135,24 +117,6 @@ def set_stage(rig: Rig, ranges: DataRanges, filming: Filming, seed: int, errors:
     lighting = replace(drawn.lighting, lamps=lamps)
     same = replace(drawn, cameras=(rig.cam1, rig.cam2), present=True, lighting=lighting, scene_from_world=scene)
     return Stage(same, ways)
-
-
-def _beside(name: str, number: int, look: Look) -> FilmPath:
-    """The path of a body that none is given for."""
-    if number >= len(PLACES_MM):
-        raise InputError(
-            f"bodies.{name}.path: needs a value: {len(PLACES_MM)} bodies have one beside the probe's, this is another"
-        )
-    place, roll = np.array(PLACES_MM[number]), ROLLS_DEG[number]
-    if not look.IN_A_HAND:
-        breath = tuple(
-            (*place[:2].tolist(), float(place[2]) + depth) for depth in (0.0, 0.5 * BREATH_MM, BREATH_MM, 0.5 * BREATH_MM)
-        )
-        return hand.Kind(seconds=BREATH_S, places_mm=breath, roll_deg=roll, turn_deg=0.0, unsteady_mm=0.0)
-    swayed = tuple(
-        tuple((place + SWAY_MM * np.array(way)).tolist()) for way in ((0, 0, 0), (0.6, -0.3, 1), (1, 0.4, 0), (0.2, 0.6, -1))
-    )
-    return hand.Kind(places_mm=swayed, roll_deg=roll)
 
 
 def make_bank(rig: Rig, ranges: DataRanges, filming: Filming, seed: int) -> Bank:

@@ -1,5 +1,5 @@
-"""Paths of a hand-led probe: along a surface in contact with it, tilted, trembling; up and down over a tank's bottom; or from
-rest to rest about wires.
+"""Paths of a hand-led probe: along a surface in contact with it, tilted, trembling; at rest on one; up and down over a tank's
+bottom; or from rest to rest about wires.
 """
 
 from typing import Annotated, Literal
@@ -46,6 +46,19 @@ class SurfacePath(Part):
     stroke_step_mm: Finite = 30.0  # from one to the next, along the array
     step_seconds: Annotated[float, Field(ge=0.05, le=60)] = 0.3  # in which the probe slides over to the next
     speed_mm_s: Positive = 10.0
+    turn_deg: Finite = 0.0  # of the array about the line of sight, from the world's x
+    tilt_deg: tuple[Finite, Finite] = (0.0, 0.0)  # off the surface's normal: in the image plane, and of the plane
+    standoff_mm: Finite = 0.0  # between the foot and the nearest point of the surface; negative presses into it
+    hand: Hand = Hand()
+
+
+class Hold(Part):
+    """At rest over a surface that faces the cameras, as a probe is held while a needle is led."""
+
+    kind: Literal["hold"] = "hold"
+    surface: str = ""  # name of the solid, where a scene has several
+    place_mm: tuple[Finite, Finite] = (4.0, -2.0)  # x, y in the world of the array's middle
+    seconds: Annotated[float, Field(gt=0, le=MOST_S)] = 10.0
     turn_deg: Finite = 0.0  # of the array about the line of sight, from the world's x
     tilt_deg: tuple[Finite, Finite] = (0.0, 0.0)  # off the surface's normal: in the image plane, and of the plane
     standoff_mm: Finite = 0.0  # between the foot and the nearest point of the surface; negative presses into it
@@ -115,6 +128,18 @@ def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed:
         places.append(_eased(one + stroke * aside, other + stroke * aside, duration))
     faces = np.stack([_place(path, place, solid, transducer) for place in np.concatenate(places)])
     return _led(faces, path.hand, shaken, transducer, seed)
+
+
+def resting(path: Hold, solid: Solid, transducer: Transducer, seed: int, shaken: Tremor = CALM) -> Track:
+    """Poses `world_from_image` over time, from 0 ns, of a probe in contact with a solid at one place, in a hand that trembles.
+
+    Raises
+    ------
+    InputError
+        If the foot is beside the solid.
+    """
+    face = _place(path, np.array(path.place_mm), solid, transducer)
+    return _led(np.tile(face, (int(path.seconds * RATE_HZ) + 1, 1, 1)), path.hand, shaken, transducer, seed)
 
 
 def _eased(start: Array, end: Array, seconds: float) -> Array:
@@ -238,7 +263,7 @@ def _upright(turn_deg: float) -> Array:
     return np.column_stack([array, depth, np.cross(array, depth)])
 
 
-def _place(path: SurfacePath, place: Array, solid: Solid, transducer: Transducer) -> Array:
+def _place(path: SurfacePath | Hold, place: Array, solid: Solid, transducer: Transducer) -> Array:
     """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
     axes = _upright(path.turn_deg)
     foot_mm = 8.0  # width of the probe's foot across the array

@@ -1,6 +1,7 @@
 """The sweep part of a session: B-scans along a path through a scene, image by image, and the truth about them."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Annotated, Protocol
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.capture.images import write_images
-from recon.capture.manifest import SCANNER, Device, Purpose, image_name
+from recon.capture.manifest import BODIES, SCANNER, Device, Purpose, image_name
 from recon.capture.writer import CaptureWriter
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -21,20 +22,38 @@ from twin.session import Session, TruthFolder, describe
 from twin.ultrasound import bscan_truth, scan_lines
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
-from twin.ultrasound.probe_path import Bob, RowPath, SurfacePath, WirePath, about_crossing, along_surface, bobbing, over_rows
+from twin.ultrasound.probe_path import (
+    Bob,
+    Hold,
+    RowPath,
+    SurfacePath,
+    WirePath,
+    about_crossing,
+    along_surface,
+    bobbing,
+    over_rows,
+    resting,
+)
 from twin.ultrasound.timed_sweep import STILL, Clocks, Plan, PoseNoise, moments, plan
 from twin.ultrasound.transducer import Transducer
 
-AnyPath = Annotated[SurfacePath | Bob | WirePath | RowPath, Field(discriminator="kind")]
+AnyPath = Annotated[SurfacePath | Hold | Bob | WirePath | RowPath, Field(discriminator="kind")]
 
 POSES = "sweep.npz"  # in the sweep's own folder of truth
 LABELS = "labels"
-PURPOSES: dict[str, Purpose] = {"wire": "probe", "rows": "probe", "bob": "latency", "stroke": "volume"}  # by the path's kind
+SCANS = "scans"  # of further bodies at the moments of the images; at the cameras' in BODIES
+PURPOSES: dict[str, Purpose] = {
+    "wire": "probe",
+    "rows": "probe",
+    "bob": "latency",
+    "stroke": "volume",
+    "hold": "volume",
+}  # by the path's kind
 SUPPORTS = ("table", "tank")  # what things lie on or in
 
 
 def plan_sweep(
-    path: SurfacePath | Bob | WirePath | RowPath,
+    path: AnyPath,
     rig: Rig,
     body: Body,
     transducer: Transducer,
@@ -58,6 +77,10 @@ def plan_sweep(
     match path:
         case SurfacePath():
             course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
+            taken = moments(course, clocks.scanner_hz)
+            _refuse_inside(course, body, transducer, gives_mm)
+        case Hold():
+            course = resting(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer, gives_mm)
         case Bob():
@@ -140,6 +163,25 @@ class FilmPart(Protocol):
         ...
 
 
+class TrackedBody(Protocol):
+    """A body besides the probe in a sweep of n images."""
+
+    @property
+    def track(self) -> Track:
+        """Poses `world_from_target` by the cameras, with their noise."""
+        ...
+
+    @property
+    def truth(self) -> Track:
+        """The same at the cameras' moments."""
+        ...
+
+    @property
+    def scanned(self) -> Track:
+        """The same at the moments when the n images are taken."""
+        ...
+
+
 def write_session(
     session: Session,
     scene: Scene,
@@ -149,6 +191,7 @@ def write_session(
     scans: Iterable[Scan],
     probe: ProbeCalibration | None,
     film: FilmPart | None = None,
+    bodies: Mapping[str, TrackedBody] = MappingProxyType({}),
 ) -> None:
     """Write a sweep and its truth, taking the scans one by one, and then the frames.
 
@@ -156,6 +199,7 @@ def write_session(
     ----------
     probe : of the capture; None where it is still to be calibrated.
     film : of the cameras, in which the poses are then still to be found; None where the poses are given.
+    bodies : further ones, by name
     """
     with session.write(_describe_sound(scene, body)) as (capture, truth):
         own = truth.own.relative_to(truth.folder)
@@ -174,8 +218,13 @@ def write_session(
             times |= dict.fromkeys(film.devices, film.times)
             devices |= film.devices
         name = session.part.partition("/")[2]
-        track = planned.track if film is None else None
-        capture.add_sweep(times, images(), devices, track, name, session.purpose)
+        track, tracks = (planned.track, {body: one.track for body, one in bodies.items()}) if film is None else (None, {})
+        capture.add_sweep(times, images(), devices, track, name, session.purpose, tracks)
+        for body, one in bodies.items():
+            arrays = {"times_ns": one.truth.times, "world_from_target": one.truth.poses}
+            truth.write_arrays(str(own / BODIES / f"{body}.npz"), arrays)
+            arrays = {"times_ns": one.scanned.times, "world_from_target": one.scanned.poses}
+            truth.write_arrays(str(own / SCANS / f"{body}.npz"), arrays)
         if film is not None:
             film.finish(capture, truth)
         if probe is not None:

@@ -141,7 +141,7 @@ def plan(
     tracked = tracked[np.isfinite(tracks.at(path, tracked)).all(axis=(1, 2))]
     design, given = probe.target_from_image.matrix(), conditions.given(errors, tracked, seed)
     target = TargetMotion(path, tracked, np.stack([rigid.moved(design, step) for step in given]))
-    seen = _noisy(target.poses(), pose_noise, rng)
+    seen = noisy(target.poses(), pose_noise, rng)
     track = Track(_stamped(tracked, 0.0, clocks.camera_jitter_s, rng), seen)
     return Plan(stamps, track, Track(taken, tracks.at(path, taken)), target)
 
@@ -152,7 +152,8 @@ def _stamped(moments: NDArray[np.int64], lag_s: float, jitter_s: float, rng: np.
     return np.maximum.accumulate(stamps) + np.arange(len(stamps))
 
 
-def _noisy(poses: Array, noise: PoseNoise, rng: np.random.Generator) -> Array:
+def noisy(poses: Array, noise: PoseNoise, rng: np.random.Generator) -> Array:
+    """Poses : (n, 4, 4) as cameras find them."""
     turns = np.deg2rad(noise.turn_deg) * rng.standard_normal((len(poses), 3))
     result = np.stack([pose @ rigid.from_rotation_vector(turn, np.zeros(3)) for pose, turn in zip(poses, turns, strict=True)])
     result[:, :3, 3] += noise.shift_mm * rng.standard_normal((len(poses), 3))

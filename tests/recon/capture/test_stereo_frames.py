@@ -250,10 +250,13 @@ def test_a_sweeps_poses_are_handed_on(rig, tmp_path, rng):
     out = tmp_path / "elsewhere" / "track"
     out.mkdir(parents=True)
     sweep_tables.write_track(out / results.POSES, before.track)
+    (out / results.BODIES / "needle").mkdir(parents=True)
+    sweep_tables.write_track(out / results.BODIES / "needle" / results.POSES, before.track)
     assert results.hand_on(out, source, out)
     after = sweep_part.read_sweep(out)
     assert len(after.paths) == len(before.paths) and np.array_equal(after.image(3), before.image(3))
     assert np.array_equal(after.track.poses, before.track.poses, equal_nan=True)
+    assert np.array_equal(after.bodies["needle"].poses, before.track.poses, equal_nan=True) and not before.bodies
     results.hand_on(out, source, out, tmp_path / "elsewhere" / "optics.yaml")
     assert manifest.read_manifest(out).calibration == "../optics.yaml"
 

@@ -354,3 +354,18 @@ def test_a_sweep_without_a_name_has_no_place_beside_named_ones(tmp_path):
         named(capture, "wires", "probe", 1)
         with pytest.raises(ValueError, match="sweep: expected none beside sweeps, which are wires, found one"):
             scans_alone(capture)
+
+
+def test_further_bodies_come_back_with_their_sweep(tmp_path):
+    """And stay where they are when another part is added."""
+    needle = Track(track().times, np.linalg.inv(track().poses))
+    images = ((SCANNER, scan) for scan in noise(5, SCAN, 9))
+    with new_capture(tmp_path / "capture", "session") as capture:
+        capture.add_sweep(
+            {SCANNER: TIMES[SCANNER]}, images, {SCANNER: Device(size=SCAN)}, track(), "scan", None, {"needle": needle}
+        )
+    with new_capture(tmp_path / "capture", add="surface") as capture:
+        surface(capture)
+    for found in (read_sweep(tmp_path / "capture"), read_sweep(tmp_path / "capture", "scan")):
+        assert list(found.bodies) == ["needle"] and np.array_equal(found.bodies["needle"].poses, needle.poses)
+    assert (tmp_path / "capture" / "sweep" / "scan" / "bodies" / "needle" / "poses.csv").is_file()

@@ -1,4 +1,4 @@
-"""A tool pivots about a tip that stays where it is, to all sides, before both cameras."""
+"""A tool pivots about a tip that stays where it is, to all sides, before both cameras; a needle goes to an aim in a B-scan."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,15 @@ import pytest
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
+from scenes.handheld.looks import needle
+from sonotwin.choices import read_rig
 from sonotwin.config import groups, load
 from sonotwin.verbs import sweep
 from sonotwin.verbs.film import Config
 from tests.twin.tracking import takes
 from twin.conditions import Motion
+from twin.tracking.film_path import Aimed
+from twin.tracking.film_paths import insertion
 
 EYES = np.array([80.0, 0.0, 0.0])
 SECONDS = np.arange(300) / 30
@@ -56,9 +60,73 @@ def test_both_cameras_see_the_circles_whole(config):
             assert (pixels > 55).all() and (pixels < np.array(camera.size) - 55).all()
 
 
+NEEDLE = needle.Kind()
+
+
+def led_needle(seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
+    """Tip : (n, 3) and direction : (n, 3) of a needle in the face's frame, every 0.1 s of a round, for a tilted probe."""
+    target = read_rig("three_bodies").bodies["needle"]
+    face = rigid.from_rotation_vector([1.2, 0.3, -0.2], [10.0, -5.0, 650.0])
+    path = insertion.Kind.model_validate(fields)
+    way = path.lead(target, EYES, seed, aimed=Aimed(NEEDLE.line_mm(target), face))
+    poses = np.linalg.inv(face) @ np.array([way.pose(time) for time in np.arange(100) * path.seconds / 100])
+    ends = np.array([rigid.apply(pose, NEEDLE.line_mm(target)) for pose in poses])
+    along = ends[:, 1] - ends[:, 0]
+    return ends[:, 1], along / np.linalg.norm(along, axis=1)[:, None]
+
+
+def test_a_needle_is_led_to_its_aim_along_its_shaft():
+    """Steadily held: it stays in the B-scan's plane, rests 22 mm deep for two seconds, and slides along itself."""
+    tip, along = led_needle(turn_deg=0, unsteady_mm=0)
+    np.testing.assert_allclose(along, np.tile([np.cos(np.radians(35)), np.sin(np.radians(35)), 0], (100, 1)), atol=1e-9)
+    np.testing.assert_allclose(tip[41:60], np.tile([0, 22, 0], (19, 1)), atol=1e-3)
+    np.testing.assert_allclose(tip[0], [0, 22, 0] - 30 * along[0], atol=1e-9)
+    np.testing.assert_allclose(np.cross(tip - tip[0], along), 0, atol=1e-2)
+
+
+def test_a_needle_crosses_the_plane_or_passes_beside_it():
+    across, along = led_needle(turn_deg=0, unsteady_mm=0, heading_deg=90, angle_deg=45, beside_mm=1.5)
+    np.testing.assert_allclose(along[0], [0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-9)
+    np.testing.assert_allclose(across[50], [0, 22, 1.5], atol=1e-6)
+    face = rigid.from_rotation_vector([1.2, 0.3, -0.2], [10.0, -5.0, 650.0])
+    entry, aim = (tuple(rigid.apply(face, place).tolist()) for place in ([-30.0, 5.0, 4.0], [5.0, 25.0, 2.0]))
+    beside, along = led_needle(turn_deg=0, unsteady_mm=0, entry_mm=entry, aim_mm=aim, beside_mm=-1.0)
+    np.testing.assert_allclose(beside[[0, 50]], [[-30, 5, 1], [5, 25, -1]], atol=1e-6)
+    np.testing.assert_allclose(along[0], np.array([35, 20, -2]) / np.linalg.norm([35, 20, -2]), atol=1e-9)
+
+
+def test_a_hand_wanders_about_the_line():
+    """By its standard deviations: of 3 axes at 8 places, so to a fifth or so."""
+    tip, along = zip(*(led_needle(seed, unsteady_mm=0.5, turn_deg=2.0) for seed in range(12)), strict=True)
+    off = np.concatenate([one[41:60] - [0, 22, 0] for one in tip])
+    assert off.std() == pytest.approx(0.5, rel=0.25)
+    straight = np.array([np.cos(np.radians(35)), np.sin(np.radians(35)), 0])
+    turned = np.degrees(np.concatenate(along) - straight)
+    assert np.sqrt((turned**2).sum(axis=1).mean() / 2) == pytest.approx(2.0, rel=0.25)
+
+
+def test_the_needles_target_faces_the_cameras():
+    target = read_rig("three_bodies").bodies["needle"]
+    for heading in (0, 70, 180):
+        path = insertion.Kind(heading_deg=heading)
+        aimed = Aimed(NEEDLE.line_mm(target), rigid.transform([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [0, 0, 650.0]))
+        way = path.lead(target, EYES, 0, aimed=aimed)
+        towards = EYES - way.pose(5.0)[:3, 3]
+        assert way.pose(5.0)[:3, 2] @ towards / np.linalg.norm(towards) > np.cos(np.radians(45)), (
+            "its normal is 41 deg off the shaft"
+        )
+
+
+def test_what_cannot_be_led_to_an_aim_is_refused(config):
+    with pytest.raises(InputError, match="expected insertion for a body with a tip"):
+        insertion.Kind().lead(config.rig.target, EYES, 0)
+    with pytest.raises(InputError, match=r"path.entry_mm: expected one apart from the aim"):
+        led_needle(entry_mm=(1.0, 2.0, 3.0), aim_mm=(1.0, 2.0, 3.0))
+
+
 def test_films_have_paths_of_their_own():
     assert groups("film")["path"] == ["hand", "pivot"]
-    assert groups("sweep")["path"] == ["bob", "none", "raster", "rows", "stroke", "wire"]
+    assert groups("sweep")["path"] == ["bob", "hold", "none", "raster", "rows", "stroke", "wire"]
     with pytest.raises(InputError, match=r"path"):
         load("sweep", ["out=unused", "path=pivot"], sweep.Config)
     with pytest.raises(InputError, match=r"tip_mm"):

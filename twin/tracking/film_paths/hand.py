@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from recon.model import circle_layout
 from recon.model.rig import Finite, NotNegative, Positive, Target, Vector
 from twin import conditions
-from twin.tracking.film_path import STILL, FilmPath, Way, facing
+from twin.tracking.film_path import STILL, Aimed, FilmPath, Way, facing
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,15 @@ class Kind(FilmPath):
     turn_deg: NotNegative = 6.0  # standard deviation about each axis, from place to place
     unsteady_mm: NotNegative = 1.0  # of the places
 
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
+    def lead(
+        self,
+        target: Target,
+        eyes: Array,
+        seed: int,
+        errors: conditions.Motion = STILL,
+        body: Sequence[int] = (),
+        aimed: Aimed | None = None,
+    ) -> Way:
         """Lead it as steadily as the path demands."""
         rng = np.random.default_rng([seed, 2, *body])
         places = np.array(self.places_mm, float)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from recon.model import circle_layout
 from recon.model.rig import Finite, Positive, Target, Vector
 from twin import conditions
-from twin.tracking.film_path import STILL, FilmPath, Way, facing
+from twin.tracking.film_path import STILL, Aimed, FilmPath, Way, facing
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,15 @@ class Kind(FilmPath):
     tilt_deg: Annotated[float, Field(ge=0, le=60)] = 25.0  # at most, about each of two axes across the shaft
     turn_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # at most, about the shaft, both ways
 
-    def lead(self, target: Target, eyes: Array, seed: int, errors: conditions.Motion = STILL, body: Sequence[int] = ()) -> Way:
+    def lead(
+        self,
+        target: Target,
+        eyes: Array,
+        seed: int,
+        errors: conditions.Motion = STILL,
+        body: Sequence[int] = (),
+        aimed: Aimed | None = None,
+    ) -> Way:
         """Lead it about the tip; the seed tells where it begins."""
         middle, tip = circle_layout.middle(target), np.array(self.tip_mm, float)
         first = facing(eyes - np.array(self.middle_mm, float), self.roll_deg)

@@ -1,0 +1,75 @@
+"""Further bodies in a sweep: led over its time, tracked with the cameras' noise by their clock, and truth at both clocks."""
+
+import numpy as np
+import pytest
+
+from recon.capture.sweep_part import read_sweep
+from recon.geometry import rigid
+from recon.model import tracks
+from sonotwin import config
+from sonotwin.cli import main
+from sonotwin.verbs.sweep import Config
+from twin.filmed_sweep import PlannedSweep, plan_sweep
+from twin.swept_bodies import mean_pose
+
+FIELDS = [
+    "rig=three_bodies", "scene=test_object", "path=hold", "path.seconds=4", "rig.probe.image_size=[48,128]",
+    "ultrasound.image_size=[48,128]", "bodies.needle={look: {kind: needle, gauge: 18}, path: {kind: insertion, seconds: 4}}",
+]  # fmt: skip
+
+
+def planned(*fields: str) -> PlannedSweep:
+    return plan_sweep(config.load("sweep", [*FIELDS, "out=unused", *fields], Config))
+
+
+def test_the_needle_is_in_the_b_scan_and_tracked_to_the_noise():
+    made = planned("path.hand.shift_mm=0", "path.hand.turn_deg=0")
+    one = made.bodies["needle"]
+    assert list(made.bodies) == ["needle", "patient"]
+    tips = np.array([rigid.apply(pose, one.look.tip_mm(one.target)) for pose in one.scanned.poses])
+    shown = np.array([rigid.apply(rigid.invert(pose), tip) for pose, tip in zip(made.plan.truth.poses, tips, strict=True)])
+    middle = made.settings.ultrasound.width_mm / 2
+    assert np.abs(shown[:, 2]).max() < 0.5 and np.abs(shown[40] - [middle, 22, 0]).max() < 0.5, "unsteady by 0.15 mm"
+    np.testing.assert_array_equal(one.track.times, made.plan.track.times)
+    steps = np.array([rigid.difference(true, seen) for true, seen in zip(one.truth.poses, one.track.poses, strict=True)])
+    count = steps[:, :3].size
+    assert np.degrees(steps[:, :3]).std() == pytest.approx(0.05, rel=4 / np.sqrt(2 * count))
+    assert steps[:, 3:].std() == pytest.approx(0.03, rel=4 / np.sqrt(2 * count))
+    between = tracks.at(one.truth, one.scanned.times[:-1])
+    np.testing.assert_allclose(between, one.scanned.poses[:-1], atol=0.05)
+
+
+def test_the_hand_trembles_and_the_post_does_not():
+    still, shaken = (planned(f"conditions.motion.tremor_mm={size}").bodies for size in (0, 0.3))
+    moved = {name: shaken[name].truth.poses[:, :3, 3] - still[name].truth.poses[:, :3, 3] for name in still}
+    assert moved["needle"].std() > 0.1 and not moved["patient"].any()
+
+
+def test_the_probes_own_poses_stay():
+    """Whether other bodies are there or not."""
+    fields = [field for field in FIELDS if not field.startswith(("bodies", "rig="))]
+    with_them, without = planned().plan, plan_sweep(config.load("sweep", [*fields, "out=unused"], Config)).plan
+    np.testing.assert_array_equal(with_them.track.poses, without.track.poses)
+    np.testing.assert_array_equal(with_them.truth.poses, without.truth.poses)
+
+
+def test_a_capture_has_their_poses_and_the_truth_has_both_clocks(tmp_path):
+    assert main(["sweep", f"out={tmp_path}", *FIELDS, "path.seconds=1"]) == 0
+    found = read_sweep(tmp_path / "capture")
+    assert sorted(found.bodies) == ["needle", "patient"] and len(found.bodies["needle"].times) == len(found.track.times)
+    own = tmp_path / "truth" / "sweep"
+    with np.load(own / "bodies" / "needle.npz") as truth, np.load(own / "scans" / "needle.npz") as scans:
+        assert truth["world_from_target"].shape == (len(found.track.times), 4, 4)
+        off = found.bodies["needle"].poses[:, :3, 3] - truth["world_from_target"][:, :3, 3]
+        assert 0.01 < off.std() < 0.05
+        assert scans["world_from_target"].shape == (len(found.times), 4, 4)
+        np.testing.assert_allclose(found.times - scans["times_ns"], 50_000_000, atol=20_000_000)
+
+
+def test_the_mean_of_poses_is_the_one_they_scatter_about(rng):
+    pose = rigid.from_rotation_vector([0.3, -2.0, 0.8], [3.0, -40.0, 600.0])
+    scattered = np.stack(
+        [pose @ rigid.from_rotation_vector(0.05 * rng.standard_normal(3), rng.standard_normal(3)) for _ in range(900)]
+    )
+    off = rigid.difference(pose, mean_pose(scattered))
+    assert np.abs(off[:3]).max() < 4 * 0.05 / 30 and np.abs(off[3:]).max() < 4 / 30

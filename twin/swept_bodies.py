@@ -1,0 +1,79 @@
+"""Bodies besides the probe in a sweep: led over the sweep's time, and tracked by the cameras as the probe is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from recon.geometry import rigid
+from recon.model.rig import Rig, Target
+from recon.model.tracks import Track
+from scenes.handheld.body_look import Look
+from twin import conditions
+from twin.tracking.film_path import STILL, Way
+from twin.tracking.film_paths import insertion
+from twin.tracking.led_bodies import LedBodies
+from twin.ultrasound import scan_lines
+from twin.ultrasound.timed_sweep import Plan, PoseNoise, noisy
+from twin.ultrasound.transducer import Transducer
+
+Array = NDArray[np.float64]
+
+STREAM = 16  # of random numbers, apart from those of the probe's poses
+
+
+@dataclass(frozen=True, eq=False)
+class SweptBody:
+    """A body besides the probe over a sweep of n images and m pairs of frames, or poses."""
+
+    look: Look
+    target: Target
+    way: Way  # at any time of the path, s
+    track: Track  # world_from_target by the cameras: (m,), stamped as the probe's poses
+    truth: Track  # the same at the cameras' moments
+    scanned: Track  # at the moments when the n images are taken
+
+
+def lead(
+    led: LedBodies,
+    rig: Rig,
+    transducer: Transducer,
+    plan: Plan,
+    noise: PoseNoise,
+    seed: int,
+    errors: conditions.Motion = STILL,
+) -> Mapping[str, SweptBody]:
+    """Lead the rig's further bodies beside the probe, each by its name; needles to the B-scan if no path is given.
+
+    Raises
+    ------
+    InputError
+        If a body finds no path, or an insertion is led by a body without a tip.
+    """
+    face, bodies = mean_pose(scan_lines.world_from_face(transducer, plan.truth.poses) @ _middle(transducer)), {}
+    for number, (name, target) in enumerate(rig.bodies.items(), 1):
+        look, given = led.look(name), led.bodies.get(name)
+        to_image = look.line_mm(target) is not None and (given is None or given.path is None)
+        path = insertion.Kind() if to_image else led.path_of(name, number - 1)
+        way = led.lead(name, path, rig, face, seed, errors)
+        truth, scanned = (_along(way, moments) for moments in (plan.target.times, plan.truth.times))
+        seen = noisy(truth.poses, noise, np.random.default_rng([seed, STREAM, number]))
+        bodies[name] = SweptBody(look, target, way, Track(plan.track.times, seen), truth, scanned)
+    return bodies
+
+
+def mean_pose(poses: Array) -> Array:
+    """Mean (4, 4) of poses (n, 4, 4)."""
+    return rigid.transform(Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix(), poses[:, :3, 3].mean(axis=0))
+
+
+def _middle(transducer: Transducer) -> Array:
+    """Frame of the middle of the face in that of the face."""
+    aside = transducer.face_mm[0] if transducer.face is None else 0.0
+    return rigid.transform(np.eye(3), [aside, 0.0, 0.0])
+
+
+def _along(way: Way, moments: NDArray[np.int64]) -> Track:
+    return Track(moments, np.stack([way.pose(time * 1e-9) for time in moments.tolist()]))
