@@ -21,6 +21,7 @@ from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan, scans
 from twin.ultrasound.echo_solids import Body, at_speeds, body
 from twin.ultrasound.timed_sweep import Clocks, Plan, PoseNoise
+from twin.ultrasound.tool_echoes import Tool
 from twin.ultrasound.transducer import Transducer, check_scanner
 
 if TYPE_CHECKING:
@@ -96,7 +97,9 @@ class PlannedSweep:
     def scans(self) -> Iterator[Scan]:
         """Render the B-scans, one by one."""
         seed = int(np.random.SeedSequence([self.settings.seed, 1]).generate_state(1)[0])
-        return scans(self.scanned, self.settings.ultrasound, self.plan.truth.poses, seed)
+        shafts = [(shaft, body.scanned.poses) for body in self.bodies.values() if (shaft := body.shaft) is not None]
+        tools = [[Tool(shaft.moved(poses[k])) for shaft, poses in shafts] for k in range(len(self.plan.times))]
+        return scans(self.scanned, self.settings.ultrasound, self.plan.truth.poses, seed, tools)
 
     def film(self, ranges: DataRanges, shown: Shown = lambda frames, _: frames) -> "SceneFilm":
         """The film of the sweep: light, body and motion of its frames, and their rendering.

@@ -11,6 +11,7 @@ from recon.geometry import rigid
 from recon.model.rig import Rig, Target
 from recon.model.tracks import Track
 from scenes.handheld.body_look import Look
+from scenes.handheld.shaft import Shaft
 from twin import conditions
 from twin.tracking.film_path import STILL, Way
 from twin.tracking.film_paths import insertion
@@ -34,6 +35,11 @@ class SweptBody:
     track: Track  # world_from_target by the cameras: (m,), stamped as the probe's poses
     truth: Track  # the same at the cameras' moments
     scanned: Track  # at the moments when the n images are taken
+
+    @property
+    def shaft(self) -> Shaft | None:
+        """The shaft that sound meets, in the target's frame; None of a body that stays outside."""
+        return self.look.shaft(self.target)
 
 
 def lead(

@@ -15,6 +15,7 @@ from recon.model import circle_layout
 from recon.model.part import Kinds
 from recon.model.rig import Target
 from scenes.handheld.mesh_parts import Part
+from scenes.handheld.shaft import Shaft
 from scenes.handheld.target_board import Board, build_board
 
 Array = NDArray[np.float64]
@@ -47,6 +48,10 @@ class Look(Kinds):
 
     def line_mm(self, target: Target) -> Array | None:
         """The middle line : (n, 3) mm of a part that is thinner than a few pixels, None without one."""
+        return None
+
+    def shaft(self, target: Target) -> Shaft | None:
+        """The shaft by which sound meets it, in the target's frame; None of a body that stays outside."""
         return None
 
 

@@ -1,6 +1,6 @@
 """B-scans of a scene, from poses: the front door of the B-mode model."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,8 @@ from twin.ultrasound.medium import scatter
 from twin.ultrasound.scan_lines import converted
 from twin.ultrasound.sound_paths import Paths, follow
 from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
+from twin.ultrasound.tool_echoes import Tool, tool_echoes
+from twin.ultrasound.tool_shadow import shaded
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -28,7 +30,9 @@ class Scan:
     paths: Paths
 
 
-def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int, frame: int = 0) -> Scan:
+def scan(
+    scene: Body, transducer: Transducer, world_from_image: Array, seed: int, frame: int = 0, tools: Sequence[Tool] = ()
+) -> Scan:
     """Take a B-scan.
 
     Parameters
@@ -42,12 +46,20 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
         Of the tissue: the same from every pose.
     frame : int
         Number of the image, which seeds the electronic noise.
+    tools : sequence of Tool
+        Where they are at that moment; each shades the tissue and the other tools.
     """
     spread = beam(transducer)
-    paths = follow(scene, transducer, world_from_image)
+    clear = follow(scene, transducer, world_from_image)
+    near = [tool for tool in tools if tool.is_near(transducer, world_from_image)]
+    paths = shaded(clear, near, transducer, world_from_image) if near else clear
     echoes = scatter(scene, transducer, spread, paths, world_from_image, seed)
     echoes += surface_echoes(scene, transducer, spread, paths, world_from_image, seed)
     echoes += wire_echoes(scene, transducer, spread, paths, world_from_image, seed)
+    for tool in near:
+        others = [other for other in near if other is not tool]
+        lit = shaded(clear, others, transducer, world_from_image) if others else clear
+        echoes += tool_echoes(tool, scene, transducer, spread, lit, world_from_image)
     received = bmode_image.focused(echoes, spread)
     received += bmode_image.noise(transducer, spread, np.random.default_rng([seed, frame]))
     received *= bmode_image.gain_over_depth(transducer, spread).astype(np.float32)[:, None]
@@ -57,7 +69,13 @@ def scan(scene: Body, transducer: Transducer, world_from_image: Array, seed: int
     return Scan(bmode_image.grey(shown, transducer), envelope, paths)
 
 
-def scans(scene: Body, transducer: Transducer, world_from_image: Array, seed: int) -> Iterator[Scan]:
-    """Take the B-scans of poses : (n, 4, 4) mm, numbered from 0, one a thread at a time; see `scan`."""
+def scans(
+    scene: Body, transducer: Transducer, world_from_image: Array, seed: int, tools: Sequence[Sequence[Tool]] | None = None
+) -> Iterator[Scan]:
+    """Take the B-scans of poses : (n, 4, 4) mm, numbered from 0, one a thread at a time; see `scan`.
+
+    tools : (n,) of each image
+    """
     poses = np.asarray(world_from_image)
-    return mapped(lambda pose, frame: scan(scene, transducer, pose, seed, frame), poses, range(len(poses)))
+    led = [()] * len(poses) if tools is None else tools
+    return mapped(lambda pose, frame, there: scan(scene, transducer, pose, seed, frame, there), poses, range(len(poses)), led)

@@ -16,10 +16,11 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
 from recon.model.tracks import Track
+from scenes.handheld.shaft import Shaft
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, TruthFolder, describe
-from twin.ultrasound import bscan_truth, scan_lines
+from twin.ultrasound import bscan_truth, scan_lines, tool_truth
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
 from twin.ultrasound.probe_path import (
@@ -181,6 +182,11 @@ class TrackedBody(Protocol):
         """The same at the moments when the n images are taken."""
         ...
 
+    @property
+    def shaft(self) -> Shaft | None:
+        """The shaft that sound meets, in the target's frame."""
+        ...
+
 
 def write_session(
     session: Session,
@@ -205,8 +211,14 @@ def write_session(
         own = truth.own.relative_to(truth.folder)
         truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
 
+        shown: dict[str, list[dict[str, NDArray]]] = {body: [] for body in bodies}
+
         def images() -> Iterator[tuple[str, NDArray[np.uint8]]]:
             for number, one in enumerate(scans):
+                for body, led in bodies.items():
+                    if led.shaft is not None:
+                        shaft, pose = led.shaft.moved(led.scanned.poses[number]), planned.truth.poses[number]
+                        shown[body].append(tool_truth.placed(shaft, transducer, one.paths, pose))
                 labels = bscan_truth.labels(one.paths, transducer)
                 write_images([truth.own / LABELS / image_name(number)], labels[None])
                 yield SCANNER, one.image
@@ -224,6 +236,7 @@ def write_session(
             arrays = {"times_ns": one.truth.times, "world_from_target": one.truth.poses}
             truth.write_arrays(str(own / BODIES / f"{body}.npz"), arrays)
             arrays = {"times_ns": one.scanned.times, "world_from_target": one.scanned.poses}
+            arrays |= {key: np.array([each[key] for each in shown[body]]) for key in (shown[body] or [{}])[0]}
             truth.write_arrays(str(own / SCANS / f"{body}.npz"), arrays)
         if film is not None:
             film.finish(capture, truth)

@@ -1,24 +1,30 @@
 """A needle: a steel shaft in a handle, the target's board on a bracket at its rear, and a hand that pinches the handle."""
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
+from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
 from recon.model import circle_layout
-from recon.model.rig import Positive, Target, Vector
+from recon.model.rig import Finite, NotNegative, Positive, Target, Vector
+from scenes.acoustics import TISSUES, Tissue
 from scenes.handheld import hand as hands
 from scenes.handheld import lofts
 from scenes.handheld.body_look import Look, Stand, board_of
 from scenes.handheld.mesh_parts import Part
+from scenes.handheld.shaft import Shaft
 from scenes.handheld.target_board import hides, pierces
 
 Array = NDArray[np.float64]
 
-# outer diameters, mm [ISO 9626, normal-walled tubing for needles]
+# outer and inner diameters, mm [ISO 9626, normal-walled tubing for needles]
 DIAMETERS_MM = {14: 2.11, 15: 1.83, 16: 1.65, 17: 1.47, 18: 1.27, 19: 1.07, 20: 0.91, 21: 0.82, 22: 0.72, 23: 0.64, 25: 0.51}
+BORES_MM = {14: 1.60, 15: 1.37, 16: 1.19, 17: 1.07, 18: 0.84, 19: 0.69, 20: 0.60, 21: 0.51, 22: 0.41, 23: 0.34, 25: 0.26}
+AIR = Tissue(0.0004, 343.0, 0.0, None)
 THICKNESS_MM = 4.0  # of the board
 HANDLE_MM, RADIUS_MM = 90.0, 8.0  # length and radius of the handle
 BELOW_MM = 8.0  # from the board's back to the handle's rear end
@@ -39,6 +45,18 @@ class Kind(Look):
     """from the handle to the tip, in the target's frame; behind the board's face"""
     mark_mm: Positive = 10.0
     """from one mark on the shaft to the next"""
+    bevel_deg: Annotated[float, Field(ge=8, le=80)] = 17.0
+    """angle of the ground tip to the shaft: 11 of a regular bevel, 17 of a short one [ISO 7864]"""
+    bevel_turn_deg: Finite = 0.0
+    """of the side on which the bevel is open about the shaft, from that of the board's face"""
+    filling: Literal["stylet", "water", "air"] = "stylet"
+    """of the bore; a stylet makes it a solid rod"""
+    roughness_um: Annotated[float, Field(ge=0, le=100)] = 1.0
+    """standard deviation of the steel's surface, assumed for a drawn tube; what shines at no angle, sound scatters by this"""
+    etched_mm: NotNegative = 0.0
+    """length from the tip that is made rough, to be seen at any angle; 0 is none"""
+    etched_um: Annotated[float, Field(ge=0, le=100)] = 20.0
+    """standard deviation of that; a tenth of a wavelength scatters nearly all"""
 
     @field_validator("gauge")
     @classmethod
@@ -73,6 +91,16 @@ class Kind(Look):
         """The shaft's ends : (2, 3) mm."""
         start, along = self.axis(target)
         return np.stack([start + HANDLE_MM * along, self.tip_mm(target)])
+
+    def shaft(self, target: Target) -> Shaft:
+        """The tube, with its bevel's point at the tip."""
+        _, along = self.axis(target)
+        bore = 0.0 if self.filling == "stylet" else BORES_MM[self.gauge] / 2
+        return Shaft(
+            self.tip_mm(target), along, _open_side(along, self.bevel_turn_deg), self.length_mm, DIAMETERS_MM[self.gauge] / 2,
+            replace(TISSUES["steel"], roughness=1e-3 * self.roughness_um), bore, AIR if self.filling == "air" else None,
+            "bevel", np.deg2rad(self.bevel_deg), 0.0, self.etched_mm, 1e-3 * self.etched_um,
+        )  # fmt: skip
 
     def parts(self, rng: np.random.Generator, target: Target, stand: Stand) -> tuple[Part, ...]:
         """Board, bracket, handle, shaft, and the hand; none where no hand is found that leaves the circles free."""
@@ -113,6 +141,14 @@ class Kind(Look):
         to_shaft = lofts.frame(start, along)
         dark = [_tinted("metal", lofts.placed(mark, to_shaft), 0.05) for mark in marks]
         return [_tinted("metal", lofts.placed(steel, to_shaft), 0.45), *dark]
+
+
+def _open_side(along: Array, turn_deg: float) -> Array:
+    """Direction : (3,) across a shaft that leans to the board's face, turned about the shaft."""
+    up = np.array([0.0, 0.0, 1.0]) - along[2] * along
+    length = np.linalg.norm(up)
+    up = up / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    return Rotation.from_rotvec(np.deg2rad(turn_deg) * along).apply(up)
 
 
 def _tinted(slot: str, mesh, reflectance: float) -> Part:
