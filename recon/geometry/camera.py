@@ -66,10 +66,10 @@ class Camera:
         if found := rigid.fault(self.camera_from_world, ROTATION):
             raise ValueError(f"camera_from_world: expected {rigid.RIGID}, found {found}")
 
-    @property
+    @cached_property
     def centre(self) -> Array:
         """The pinhole in the world : (3,) mm."""
-        return rigid.invert(self.camera_from_world)[:3, 3]
+        return _fixed(rigid.invert(self.camera_from_world)[:3, 3])
 
     @cached_property
     def coefficients(self) -> Array:

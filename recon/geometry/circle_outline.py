@@ -29,7 +29,8 @@ def ellipses_of(
     """
     camera_from_target = np.ascontiguousarray(camera.camera_from_world @ world_from_target)
     slopes = np.zeros((len(centres), 2)) if slopes is None else slopes
-    rows = _ellipses(camera_from_target, centres, slopes, radius_mm, camera.matrix, camera.coefficients)
+    own = np.array(centres), np.array(slopes)  # that can be written to: compiled for one kind of array alone
+    rows = _ellipses(camera_from_target, *own, radius_mm, camera.matrix, camera.coefficients)
     return rows[:, :2], rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
 
 

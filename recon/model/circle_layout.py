@@ -5,7 +5,7 @@ lengths: c1 along x; then of each further one its place along x, called aside, a
 kind, a module of `recon.model.targets`.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -54,14 +54,21 @@ def _by_length(circles: int) -> Array:
     return slopes
 
 
+def _fixed(values: Array) -> Array:
+    """The array itself, which can't be written to any more."""
+    values.setflags(write=False)
+    return values
+
+
 def by_length(target: Target) -> Array:
     """Derivatives : (n, 3, 2 n - 3) of the circles' places by the lengths."""
     return _by_length(count(target))
 
 
+@lru_cache
 def circle_centres(target: Target) -> Array:
-    """Centres : (n, 3) mm of the circles in the target's frame."""
-    return by_length(target) @ lengths(target)
+    """Centres : (n, 3) mm of the circles in the target's frame; not to be written to."""
+    return _fixed(by_length(target) @ lengths(target))
 
 
 def extent(target: Target) -> Array:
@@ -86,9 +93,11 @@ class Circles(NamedTuple):
         return self._replace(centres=self.centres[which], slopes=self.slopes[which])
 
 
+@lru_cache
 def circles(target: Target) -> Circles:
-    """The outer rims of all circles."""
-    return laid_out(lengths(target), target.outer_diameter_mm, np.array(target.curvature_per_m))
+    """The outer rims of all circles; not to be written to."""
+    centres, radius_mm, slopes = laid_out(lengths(target), target.outer_diameter_mm, np.array(target.curvature_per_m))
+    return Circles(_fixed(centres), radius_mm, _fixed(slopes))
 
 
 def laid_out(lengths_mm: Array, diameter_mm: float, curvature_per_m: Array) -> Circles:
@@ -124,8 +133,11 @@ def length_covariance(target: Target) -> Array:
     return target.tolerance_mm**2 * by_place @ by_place.T
 
 
+@lru_cache
 def deviations(target: Target) -> Array:
-    """Displacements : (n, 3, k) mm of (circle, axis) by k standard normal numbers, as the lengths' covariance has it."""
+    """Displacements : (n, 3, k) mm of (circle, axis) by k standard normal numbers, as the lengths' covariance has it; not to be
+    written to.
+    """
     variances, axes = np.linalg.eigh(length_covariance(target))
     kept = variances > NEGLIGIBLE
-    return by_length(target) @ (axes[:, kept] * np.sqrt(variances[kept]))
+    return _fixed(by_length(target) @ (axes[:, kept] * np.sqrt(variances[kept])))

@@ -20,8 +20,8 @@ from recon.tracking.circle_detector import Detections
 from recon.tracking.constellations import Points
 from recon.tracking.pose import DISTINCT, UNTOLD, same
 from recon.tracking.pose_fit import lost
-from recon.tracking.rims import Outlines, hole_of, measure_again
-from recon.tracking.tracker import NO_NETWORKS, Moment, Tracker, Tracking, paired, rank
+from recon.tracking.rims import Outlines, hole_of, measure_again, measure_all
+from recon.tracking.tracker import NO_NETWORKS, Frames, Moment, Tracker, Tracking, paired, rank
 from recon.tracking.views import diameter, doubted
 
 CIRCLES = 40  # candidates of a window, of all bodies and of what else is round
@@ -56,15 +56,17 @@ class BodyTracker:
             frames = paired(first.cameras, (left, right), first.bits)
         except InputError as error:
             return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
-        results = {name: tracker.follow(frames, moment) for name, tracker in self.trackers.items()}
-        found = {name: result for name, result in results.items() if result is not None and result.found}
+        results = self._followed(frames, moment)
+        found = {name: result for name, result in results.items() if result.found}
         if first.networks is not None:
             look = self._looked is None or not 0 <= moment.now - self._looked < moment.look
             if look or self._search_is_due(found, moment, time_s is not None):
                 results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
                 self._searched, self._looked = moment.now, moment.now if look else self._looked
         reason = NO_NETWORKS if first.networks is None else WAITING
-        kept = {name: tracker.keep(results[name] or tracker.unseen(reason), moment) for name, tracker in self.trackers.items()}
+        kept = {
+            name: tracker.keep(results.get(name) or tracker.unseen(reason), moment) for name, tracker in self.trackers.items()
+        }
         seconds = {"bodies": (perf_counter() - start) / len(kept)}
         return {name: replace(result, seconds=seconds) for name, result in kept.items()}
 
@@ -73,6 +75,17 @@ class BodyTracker:
         self._searched = self._looked = None
         for tracker in self.trackers.values():
             tracker.forget()
+
+    def _followed(self, frames: Frames, moment: Moment) -> dict[str, Tracking]:
+        """Results of the bodies whose last poses say where they are; all their rims are measured at once."""
+        known = {name: tracker.ahead(moment) for name, tracker in self.trackers.items()}
+        sought = {name: each for name, each in known.items() if each is not None}
+        if not sought:
+            return {}
+        rims = measure_all(*frames, list(sought.values()))
+        return {
+            name: self.trackers[name].follow(frames, each, own) for (name, each), own in zip(sought.items(), rims, strict=True)
+        }
 
     def _search_is_due(self, found: Mapping[str, Tracking], moment: Moment, timed: bool) -> bool:
         """Whether to search for what is lost."""

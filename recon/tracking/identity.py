@@ -7,7 +7,7 @@ and the ellipses must be those that the distances ask for; of three circles that
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import permutations
 
 import numpy as np
@@ -111,8 +111,20 @@ def affinity(points: Array, target: Target) -> Array:
 
 def affinity_of(points: Array, places: Array) -> Array:
     """The affinity : (..., 2, 2) px/mm that takes places : (..., n, 2) mm to points : (..., n, 2) px with least squares."""
-    from_middle, arms = (each - each.mean(axis=-2, keepdims=True) for each in (points, places))
-    return np.swapaxes(from_middle, -1, -2) @ np.linalg.pinv(np.swapaxes(arms, -1, -2))
+    from_middle = points - points.mean(axis=-2, keepdims=True)
+    inverse = _inverse_arms(places) if places.ndim > 2 else _kept_inverse_arms(*map(tuple, places.tolist()))
+    return np.swapaxes(from_middle, -1, -2) @ inverse
+
+
+def _inverse_arms(places: Array) -> Array:
+    """Pseudoinverses : (..., n, 2) of the arms from the middle of places : (..., n, 2)."""
+    return np.linalg.pinv(np.swapaxes(places - places.mean(axis=-2, keepdims=True), -1, -2))
+
+
+@lru_cache
+def _kept_inverse_arms(*places: tuple[float, float]) -> Array:
+    """The same of a target's circles, of which each pair of frames asks anew."""
+    return _inverse_arms(np.array(places))
 
 
 def _in_line(places: Array) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ and radius R: 0.0012 px for n = 1, C = 100, s = 0.6, R = 45. `recon.tracking.rim
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,15 @@ FARTHEST = 0.4  # of the smaller semi-axis, that a rough rim may be off
 ELSEWHERE = "not at the place that the others predict"
 
 
+class Sought(NamedTuple):
+    """Rings of a target that are sought in two frames."""
+
+    rough: Ellipses  # of n
+    of_second: NDArray[np.bool_]  # (n,) that lie in the second frame
+    reach: float | Array  # or (n,) px, largest error of the rough rims
+    target: Target
+
+
 class Known(NamedTuple):
     """Standard deviations of what is known of a rim before it is fitted."""
 
@@ -56,6 +66,9 @@ class Known(NamedTuple):
 
 
 UNKNOWN = Known(np.inf, np.inf)
+UNFITTED = np.zeros((), FIT)
+for _name in set(FIT.names or ()) - {"found"}:
+    UNFITTED[_name] = np.nan
 
 
 @dataclass(frozen=True)
@@ -79,12 +92,12 @@ class Outlines:
         """Of the centres : (n, 2, 2) px^2."""
         return self.joint[:, :2, :2]
 
-    @property
+    @cached_property
     def found(self) -> NDArray[np.bool_]:
         """Whether each is a ring : (n,)."""
         return np.array([reason is None for reason in self.reasons], bool)
 
-    @property
+    @cached_property
     def rings(self) -> Ellipses:
         """The ellipses of those that are rings, NaN of the others."""
         return Ellipses(
@@ -143,20 +156,19 @@ def measure(image: NDArray, rough: Ellipses, reach: float | Array, target: Targe
     reach : float or (n,) px
         Largest error of the rough rims; beyond 0.4 of the smaller semi-axis as if it were that: neighbours come into reach.
     """
-    return measure_both(image, image, rough, np.zeros(len(rough.centre), bool), reach, target)
+    (outlines,) = measure_all(image, image, [Sought(rough, np.zeros(len(rough.centre), bool), reach, target)])
+    return outlines
 
 
-def measure_both(
-    first: NDArray,
-    second: NDArray,
-    rough: Ellipses,
-    of_second: NDArray[np.bool_],
-    reach: float | Array,
-    target: Target,
-) -> Outlines:
-    """The same for rings in two frames at once; those of `of_second` : (n,) lie in the second."""
-    fits = _fitted(first, second, rough, of_second, reach, UNKNOWN, target)
-    return _judged(fits, np.zeros((len(fits), 5)), target, middles=True)
+def measure_all(first: NDArray, second: NDArray, sought: Sequence[Sought]) -> list[Outlines]:
+    """The same for rings of several targets in two frames, all at once: threads share them."""
+    starts = np.concatenate([_starts(each, UNKNOWN) for each in sought])
+    fits = _fitted(first, second, starts)
+    every = _judged(fits, np.zeros((len(fits), 5)), starts["hole"], middles=True)
+    if len(sought) == 1:
+        return [every]
+    ends = np.cumsum([len(each.rough.centre) for each in sought]).tolist()
+    return [every[end - len(each.rough.centre) : end] for end, each in zip(ends, sought, strict=True)]
 
 
 def measure_again(image: NDArray, rims: Outlines, target: Target) -> Outlines:
@@ -172,28 +184,25 @@ def reach_px(rough: Ellipses, share: float) -> Array:
 
 def measure_covered(image: NDArray, rough: Ellipses, reach: float | Array, known: Known, target: Target) -> Outlines:
     """The same for rings whose middle may be hidden, of which something is known before."""
-    fits = _fitted(image, image, rough, np.zeros(len(rough.centre), bool), reach, known, target)
-    return _judged(fits, known.certainty(rough.shape), target, middles=False)
+    starts = _starts(Sought(rough, np.zeros(len(rough.centre), bool), reach, target), known)
+    return _judged(_fitted(image, image, starts), known.certainty(rough.shape), starts["hole"], middles=False)
 
 
-def _fitted(
-    first: NDArray,
-    second: NDArray,
-    rough: Ellipses,
-    of_second: NDArray[np.bool_],
-    reach: float | Array,
-    known: Known,
-    target: Target,
-) -> NDArray:
-    kind = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32
-    starts, fits = np.empty(len(rough.centre), START), np.zeros(len(rough.centre), FIT)
-    starts["second"], starts["reach"] = of_second, np.minimum(reach, _smaller_axis(rough) * FARTHEST)
+def _starts(sought: Sought, known: Known) -> NDArray:
+    """Starts of the fit : (n,) START."""
+    rough, starts = sought.rough, np.empty(len(sought.rough.centre), START)
+    starts["second"], starts["hole"] = sought.of_second, hole_of(sought.target)
+    starts["reach"] = np.minimum(sought.reach, _smaller_axis(rough) * FARTHEST)
     starts["place_sigma"], starts["shape_sigma"] = known.place_px, known.shape * np.trace(rough.shape, axis1=1, axis2=2) / 2
     starts["x"], starts["y"] = rough.centre.T
     starts["a"], starts["b"], starts["c"] = rough.shape[:, 0, 0], rough.shape[:, 0, 1], rough.shape[:, 1, 1]
-    for name in set(FIT.names) - {"found"}:
-        fits[name] = np.nan
-    fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, hole_of(target), fits)
+    return starts
+
+
+def _fitted(first: NDArray, second: NDArray, starts: NDArray) -> NDArray:
+    """Fits : (n,) FIT of rims in two frames; NaN where none is found."""
+    kind, fits = np.uint8 if first.dtype == second.dtype == np.uint8 else np.float32, np.full(len(starts), UNFITTED)
+    fit_rims(np.ascontiguousarray(first, kind), np.ascontiguousarray(second, kind), starts, fits)
     return fits
 
 
@@ -219,9 +228,11 @@ def _widened(covariance: Array, times: Array, known: Array) -> Array:
     return np.linalg.inv((np.linalg.inv(covariance) - before) / times[:, None, None] + before)
 
 
-def _judged(fits: NDArray, known: Array, target: Target, middles: bool) -> Outlines:
-    """Rims by their fits, with the inverse variances : (n, 5) px^-2 of what was known of them before."""
-    hole = hole_of(target)
+def _judged(fits: NDArray, known: Array, holes: Array, middles: bool) -> Outlines:
+    """Rims by their fits, with the inverse variances : (n, 5) px^-2 of what was known of them before.
+
+    holes : (n,) inner over outer diameters.
+    """
     centre = np.stack([fits["x"], fits["y"]], axis=1)
     shape = np.stack([fits["a"], fits["b"], fits["b"], fits["c"]], axis=1).reshape(-1, 2, 2)
     inside, outside, middle, seen, spread = (fits[name] for name in ("inside", "outside", "middle", "seen", "uneven"))
@@ -247,9 +258,9 @@ def _judged(fits: NDArray, known: Array, target: Target, middles: bool) -> Outli
             reasons.append(f"a contrast of {contrast:.1f} DN in noise of {noise[i]:.1f}")
         elif not seen[i] >= LEAST_SEEN:
             reasons.append(f"{100 * seen[i]:.0f} % of its rim seen")
-        elif middles and not middle[i] - inside[i] > BRIGHT * contrast * (1 - np.sqrt(v0[i]) / (hole * semi[i])):
+        elif middles and not middle[i] - inside[i] > BRIGHT * contrast * (1 - np.sqrt(v0[i]) / (holes[i] * semi[i])):
             reasons.append("no white middle")
-        elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - hole) * semi[i]:
+        elif not np.sqrt(v0[i]) <= LARGEST_BLUR * (1 - holes[i]) * semi[i]:
             reasons.append(f"blurred by {np.sqrt(12 * v0[i]):.0f} px")
         elif not sigma[i] <= LARGEST_SIGMA:
             reasons.append(f"an uncertainty of {sigma[i]:.1f} px")

@@ -29,7 +29,7 @@ from recon.tracking.identity import Naming
 from recon.tracking.networks import Networks
 from recon.tracking.pose import DISTINCT, UNTOLD, estimate, exchanged, same
 from recon.tracking.pose_fit import Sighting, TargetPose, lost
-from recon.tracking.rims import Outlines, measure, measure_both, reach_px
+from recon.tracking.rims import Outlines, Sought, measure, measure_all, reach_px
 from recon.tracking.views import View
 
 Array = NDArray[np.float64]
@@ -164,7 +164,8 @@ class Tracker:
         except InputError as error:
             return replace(self.unseen(str(error)), seconds=watch.seconds)
         watch.stop("frames")
-        result = self.follow(frames, moment, watch)
+        sought = self.ahead(moment)
+        result = None if sought is None else self.follow(frames, sought, measure_all(*frames, [sought])[0], watch)
         if self.networks is not None:
             detections = Detections(frames, self.networks)
             if result is None or not result.found:
@@ -180,18 +181,22 @@ class Tracker:
         self._clock += 1
         return Moment(self._clock, FORGOTTEN_FRAMES, GONE_FRAMES, LOOK_FRAMES) if time_s is None else Moment(time_s)
 
-    def follow(self, frames: Frames, moment: Moment, watch: "_Watch | None" = None) -> Tracking | None:
-        """Look where the last poses say that the target is: by its rims alone, then by the segmenter. None if they don't say."""
-        watch = watch or _Watch()
+    def ahead(self, moment: Moment) -> Sought | None:
+        """The rims where the last poses say that the target is; None if they don't say."""
         if not (self._past and 0 < moment.now - self._past[-1][0] <= moment.forgotten):
             return None
         rough = self._rough(self._predicted(moment.now))
         if not np.isfinite(rough.centre).all():
             return None
-        result = self._fitted(frames, rough, FOLLOWED if len(self._past) > 1 else BLIND, "predicted")
+        return self._sought(rough, FOLLOWED if len(self._past) > 1 else BLIND)
+
+    def follow(self, frames: Frames, sought: Sought, outlines: Outlines, watch: "_Watch | None" = None) -> Tracking:
+        """The target by rims that are measured where it was sought `ahead`; if these fail, by the segmenter there."""
+        watch = watch or _Watch()
+        result = self._fitted(frames, outlines, "predicted")
         watch.stop("predict")
         if not result.found and self.networks is not None:
-            result = self._segmented(frames, self.networks, rough, result)
+            result = self._segmented(frames, self.networks, sought.rough, result)
             watch.stop("segment")
         return result
 
@@ -307,9 +312,12 @@ class Tracker:
         """Ellipses that camera k should show of a pose."""
         return Ellipses(*ellipses_of(self.cameras[k], world_from_target, *circle_layout.circles(self.target)))
 
-    def _fitted(self, frames: Frames, rough: Ellipses, reach: float, how: str) -> Tracking:
-        """From rough ellipses of both views, off by a share of a disc at most, to the pose."""
-        outlines = measure_both(*frames, rough, np.arange(2 * self.count) >= self.count, reach_px(rough, reach), self.target)
+    def _sought(self, rough: Ellipses, reach: float) -> Sought:
+        """Rims of both views, from rough ellipses that are off by a share of a disc at most."""
+        return Sought(rough, np.arange(2 * self.count) >= self.count, reach_px(rough, reach), self.target)
+
+    def _fitted(self, frames: Frames, outlines: Outlines, how: str) -> Tracking:
+        """From the rims of both views to the pose."""
         halves = [
             covered_circle.completed(*each, self.target)
             for each in zip(frames, (outlines[: self.count], outlines[self.count :]), strict=True)
@@ -367,7 +375,8 @@ class Tracker:
         ]
         if min(np.isfinite(half.centre[:, 0]).sum() for half in halves) < 2:
             return before
-        return self._fitted(frames, joined(halves), circle_segmenter.OFF, "segmented")
+        (outlines,) = measure_all(*frames, [self._sought(joined(halves), circle_segmenter.OFF)])
+        return self._fitted(frames, outlines, "segmented")
 
     def find(self, detections: Detections) -> Tracking:
         """Search both frames, level by level of what the detector sees of them."""

@@ -54,6 +54,7 @@ START = np.dtype([
     ("x", float), ("y", float),  # px, the centre
     ("a", float), ("b", float), ("c", float),  # px, the shape (a b; b c)
     ("reach", float),  # px, largest error of the rough rim
+    ("hole", float),  # inner over outer diameter of the ring
     ("place_sigma", float), ("shape_sigma", float),  # px, standard deviations of what is known of the rim before, else inf
 ], align=True)  # fmt: skip
 """A rough rim to start from."""
@@ -86,15 +87,12 @@ class Prior(NamedTuple):
     shape_sigma: float
 
 
-def fit_rims(first: NDArray, second: NDArray, starts: NDArray, hole: float, fits: NDArray) -> None:
-    """Fit n rims in two images of one type, from `starts` : (n,) START to `fits` : (n,) FIT, written where a rim is found.
-
-    `hole` is the inner over the outer diameter.
-    """
+def fit_rims(first: NDArray, second: NDArray, starts: NDArray, fits: NDArray) -> None:
+    """Fit n rims in two images of one type, from `starts` : (n,) START to `fits` : (n,) FIT, written where a rim is found."""
 
     def fit(begin: int, end: int) -> None:
         for i in range(begin, end):
-            _fit(second if starts["second"][i] else first, starts, i, hole, fits)
+            _fit(second if starts["second"][i] else first, starts, i, starts["hole"][i], fits)
 
     in_threads(fit, len(starts))
 

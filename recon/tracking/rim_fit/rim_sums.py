@@ -220,17 +220,32 @@ def first_levels(image, rim: Rim, reach, hole):
     dark_count, dark_sum = np.zeros(SECTORS), np.zeros(SECTORS)
     bright_count, bright_sum = np.zeros(SECTORS), np.zeros(SECTORS)
     sectors, shape = geometry(rim, reach, hole), inverse_shape(rim)
-    left, right, top, bottom = window(rim, 1 + OUTERMOST, image.shape)
+    inner, outer = _widest(sectors)
+    shortest = shortest_axis(rim)
+    lowest = max(1 - inner * 1.2 / shortest, hole) ** 2
+    highest = min(1 + outer * 1.2 / shortest, 1 + OUTERMOST)
+    left, right, top, bottom = window(rim, highest, image.shape)
+    highest = highest * highest
     for v in range(top, bottom):
         y = v - rim.y
-        for u in range(left, right):
+        middle, half, empty = _chords(shape, y, lowest, highest)
+        if not half >= 0:
+            continue
+        middle += rim.x
+        u = max(left, int(middle - half) + 1) - 1
+        last = min(right - 1, int(middle + half))
+        while u < last:
+            u += 1
+            if abs(u - middle) < empty - 1:
+                u += int(middle + empty - 1 - u)
             x = u - rim.x
             p, q = shape.a * x + shape.b * y, shape.b * x + shape.c * y
             away = math.sqrt(p * p + q * q)
             if away < hole or away > 1 + OUTERMOST:
                 continue
             j = int(sector(p, q))
-            distance = (away - 1) * away / math.hypot(shape.a * p + shape.b * q, shape.b * p + shape.c * q)
+            sx, sy = shape.a * p + shape.b * q, shape.b * p + shape.c * q
+            distance = (away - 1) * away / math.sqrt(sx * sx + sy * sy)
             if -sectors[j].inner < distance < -0.35 * sectors[j].inner:
                 dark_count[j] += 1
                 dark_sum[j] += image[v, u]

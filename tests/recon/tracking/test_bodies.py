@@ -93,6 +93,27 @@ def test_each_is_as_exact_as_if_it_were_alone(rig, cameras, found_by, places, fr
         assert off @ np.linalg.solve(alone.pose.covariance + together[name].pose.covariance, off) < 30  # chi-square, 6 degrees
 
 
+def test_bodies_followed_at_once_are_followed_as_each_alone(rig, cameras, found_by, rng):
+    """The same rims to the last digit: those of other bodies, of other numbers and sizes, are measured in the same call."""
+    small = rig.target.model_dump() | {"outer_diameter_mm": 13.0, "inner_diameter_mm": 6.5}
+    other = Rig.model_validate(rig.model_dump() | {"bodies": {"needle": small}})
+    places = dict(zip(other.targets, drawings.apart(rng, list(other.targets.values())), strict=True))
+    shown = pair(cameras, [(places[name], target) for name, target in other.targets.items()], rng)
+    alone = {name: Tracker(cameras, target, found_by) for name, target in other.targets.items()}
+    together = of(other, cameras, found_by)
+    for name, one in alone.items():
+        for each in (one, together.trackers[name]):
+            each.remember(places[name], 0.0)
+    for time_s in (0.02, 0.04):
+        found = together.step(*shown, time_s)
+        for name, one in alone.items():
+            by_itself = one.step(*shown, time_s)
+            assert found[name].how == by_itself.how == "predicted"
+            np.testing.assert_array_equal(found[name].pose.world_from_target, by_itself.pose.world_from_target)
+            np.testing.assert_array_equal(found[name].pose.total, by_itself.pose.total)
+            assert found[name].pose.triangle.lengths_mm == pytest.approx(circle_layout.lengths(other.targets[name]), abs=0.1)
+
+
 @pytest.mark.parametrize("missing", ["probe", "needle", "patient"])
 def test_one_that_is_away_is_lost_and_no_other_is_taken_for_it(rig, cameras, tracker, places, missing):
     bodies = [(places[name], target) for name, target in rig.targets.items() if name != missing]

@@ -155,8 +155,8 @@ def test_a_doubtful_rim_that_is_off_is_told_by_the_pose(cameras, rig, pair, monk
     """Half a pixel: the other five tell the pose, and that where it is; a rim that nothing speaks against spoils the frame."""
     tracker = Tracker(cameras, rig.target.model_copy(update={"tolerance_mm": 0.0}))
     tracker.remember(FACING, 0.0)
-    real = tracking.measure_both
-    monkeypatch.setattr(tracking, "measure_both", lambda *given: shifted(real(*given), 4, [0.5, -0.3], doubtful))
+    real = tracking.measure_all
+    monkeypatch.setattr(tracking, "measure_all", lambda *given: [shifted(real(*given)[0], 4, [0.5, -0.3], doubtful)])
     found = tracker.step(*pair, time_s=0.02)
     assert found.found == doubtful
     if doubtful:
