@@ -32,7 +32,7 @@ class Crops:
 
     images: Tensor  # (n, 1, h, w) grey/255
     labels: Labels
-    places: Tensor  # (n, 3, 2) coarse places of the circles, px, not rounded; NaN without a target
+    places: Tensor  # (n, circles, 2) coarse places of the circles, px, not rounded; NaN without a target
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
     linear = turns(size, SCALES, generator)
     anywhere = torch.rand(size, 2, generator=generator) * torch.tensor([width - 1.0, height - 1.0])
     about = (torch.rand(size, generator=generator) < TARGET_IN_CROP) & (visible >= SEEN).any(1)
-    source = torch.where(about[:, None], torch.nan_to_num(centres.mean(1)), anywhere)
+    middle = _middle(centres, visible, torch.from_numpy(views.body[which]), generator)
+    source = torch.where(about[:, None], middle, anywhere)
     goal = edge * uniform(0.15, 0.85, (size, 2), generator)
     images = warp(images, linear, source, goal, (edge, edge), _fill(images, generator))
     places = moved(centres, linear, source, goal)
@@ -121,7 +122,19 @@ def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
     visible = torch.where(_at(covered, places), visible.clamp(max=COVERED), visible)
     places = places + label_offset(scale)[:, None]
     images = photograph(images, white, COARSEST, generator) / WHITE
-    return Crops(images, labels(places, visible, (edge, edge)), places)
+    names = torch.from_numpy(views.identity[which])
+    return Crops(images, labels(places, visible, names, (edge, edge)), places)
+
+
+def _middle(centres: Tensor, visible: Tensor, body: Tensor, generator: Generator) -> Tensor:
+    """Middle (n, 2) of a target in each view: of several, one that is seen. 0 without a target."""
+    chosen = torch.zeros(len(centres), dtype=torch.int64)
+    if body.max() > 0:
+        seen = (visible >= SEEN).float()
+        seen[:, 0] += seen.sum(1) == 0
+        chosen = body.gather(1, torch.multinomial(seen, 1, generator=generator))[:, 0]
+    its = body == chosen[:, None]
+    return torch.nan_to_num(torch.where(its[..., None], centres, 0.0).sum(1) / its.sum(1, keepdim=True))
 
 
 def discs(patches: Patches, size: int, generator: Generator) -> Discs:

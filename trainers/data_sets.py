@@ -1,18 +1,11 @@
 """Data sets of all kinds as one: shards of `sonotwin dataset`, and MarkerPose's folders after them."""
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
-
-import numpy as np
 
 from recon.errors import InputError
 from trainers import markerpose_layout, shard_reader
-from trainers.shard_reader import Data, Patches, Tell, Views
-from trainers.stored_images import StoredImages
-
-Some = TypeVar("Some", bound=Data)
+from trainers.shard_reader import Patches, Tell, Views, joined
 
 
 def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Views:
@@ -40,21 +33,6 @@ def with_patches(folders: Sequence[Path]) -> list[Path]:
     shards, others = _kinds(folders)
     have = [*filter(shard_reader.has_patches, shards), *filter(markerpose_layout.has_patches, others)]
     return [folder for folder in folders if folder in have]
-
-
-def joined(parts: Sequence[Some]) -> Some:
-    """Samples of all parts, one after the other; their images may lie in files of any kind."""
-    first, *others = parts
-    for part in others:
-        columns = {field.name: _stacked(getattr(first, field.name), getattr(part, field.name)) for field in fields(first)}
-        first = replace(first, **columns | {"sample": np.append(first.sample, part.sample + first.sample[-1] + 1)})
-    return first
-
-
-def _stacked(one: StoredImages | np.ndarray, other: StoredImages | np.ndarray) -> StoredImages | np.ndarray:
-    if isinstance(one, StoredImages) and isinstance(other, StoredImages):
-        return one.followed_by(other)
-    return np.concatenate([one, other])
 
 
 def _kinds(folders: Sequence[Path]) -> tuple[list[Path], list[Path]]:

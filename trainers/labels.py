@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, cross_entropy
 
 from trainers.architectures import CELL, NO_PIXEL
-from trainers.shard_truth import HIDDEN, SEEN
+from trainers.shard_truth import HIDDEN, SEEN, UNNAMED
 
 NEAR = 1.5  # px, within which a cell beyond the border knows a circle's identity too: the peak may fall there
 IGNORED = -100  # a class that doesn't count
@@ -24,7 +24,7 @@ class Labels:
     """Classes of the cells of n views."""
 
     pixel: Tensor  # (n, h/8, w/8) int64: 8 row + column, 64 for none, IGNORED
-    identity: Tensor  # (n, h/8, w/8) int64: 0, 1 and on, the number of circles for none, IGNORED
+    identity: Tensor  # (n, h/8, w/8) int64: 0, 1 and on, the number of identities for none, IGNORED
 
 
 def label_offset(scale: Tensor) -> Tensor:
@@ -37,21 +37,24 @@ def seen_in_view(centres: Tensor, scale: Tensor) -> Tensor:
     return (centres + 0.5) / scale[:, None] - 0.5
 
 
-def labels(places: Tensor, visible: Tensor, size: tuple[int, int]) -> Labels:
+def labels(places: Tensor, visible: Tensor, names: Tensor, size: tuple[int, int]) -> Labels:
     """Classes of cells.
 
     Parameters
     ----------
     places : (n, circles, 2) float, px
-        Coarse places of c0, c1 and on, not yet rounded, NaN where there is no target.
+        Coarse places, not yet rounded, NaN where there is no target.
     visible : (n, circles) float
         Fraction of each disc that is seen.
+    names : (n, circles) int64
+        Each circle's identity, UNNAMED of those that count for their place alone.
     size : (width, height) of the views, px, multiples of 8
     """
     width, height = size
     n = len(places)
     pixel = torch.full((n, height // CELL, width // CELL), NO_PIXEL)
-    identity = torch.full_like(pixel, places.shape[1])
+    identity = torch.full_like(pixel, int(names.max()) + 1)
+    names = torch.where(names == UNNAMED, IGNORED, names)
     known = torch.isfinite(places).all(-1)
     nearest = torch.where(known[..., None], places, torch.full_like(places, -1e6)).round().long()
     inside = known & (nearest >= 0).all(-1) & (nearest[..., 0] < width) & (nearest[..., 1] < height)
@@ -65,8 +68,8 @@ def labels(places: Tensor, visible: Tensor, size: tuple[int, int]) -> Labels:
                 for down in (-NEAR, NEAR):
                     column = ((exact[:, 0] + right) / CELL).long().clamp(0, width // CELL - 1)
                     row = ((exact[:, 1] + down) / CELL).long().clamp(0, height // CELL - 1)
-                    identity[view, row, column] = circle
-        identity[view, v // CELL, u // CELL] = circle if shown else IGNORED
+                    identity[view, row, column] = names[view, circle]
+        identity[view, v // CELL, u // CELL] = names[view, circle] if shown else IGNORED
         pixel[view, v // CELL, u // CELL] = CELL * (v % CELL) + u % CELL if shown else IGNORED
     return Labels(pixel, identity)
 

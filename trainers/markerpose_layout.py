@@ -63,6 +63,8 @@ def read_views(folder: Path) -> Views:
         np.ones((n, 3)),
         np.ones((n, 3), bool),
         np.full((n, 3), np.nan),
+        np.tile(np.arange(3), (n, 1)),
+        np.zeros((n, 3), np.int64),
         np.full(n, np.nan),
         np.arange(n),
     )
@@ -129,7 +131,7 @@ def write_views(folder: Path, views: Views) -> int:
     InputError
         If there is none, or the target has other circles.
     """
-    _check_three(views.centres.shape[1])
+    _check_three(views)
     places = (views.centres + 0.5) / views.scale[:, None] - 0.5
     with np.errstate(invalid="ignore"):
         held = ((places >= 0) & (places <= np.array(VIEW) - 1)).all((1, 2)) & (views.visible >= SEEN).all(1)
@@ -163,8 +165,13 @@ def write_patches(folder: Path, patches: Patches) -> int:
     return count
 
 
-def _check_three(circles: int) -> None:
-    if circles != 3:
+def _check_three(views: Views) -> None:
+    if views.body.max() > 0:
+        raise InputError(
+            "data: expected views of one target each, which MarkerPose's networks are for, found further bodies; "
+            "make a set with a rig without bodies"
+        )
+    if (circles := views.centres.shape[1]) != 3:
         raise InputError(f"data: expected a target of three circles, which MarkerPose's networks are for, found {circles}")
 
 

@@ -1,7 +1,7 @@
 """Figures of merit of a network on whole validation views and patches, decoded as in the tracker.
 
 A detector's answer becomes circles as published: softmax over a cell's classes, scores of all pixels, of those within 4 px of
-each other the best, above 0.015 the best, as many as the target has, each with the identity that its cell says.
+each other the best, above 0.015 the best, as many as the targets have, each with the identity that its cell says.
 """
 
 import math
@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from trainers.architectures import NO_PIXEL
 from trainers.shard_reader import Patches, Views
-from trainers.shard_truth import HIDDEN, SEEN
+from trainers.shard_truth import HIDDEN, SEEN, UNNAMED
 
 Array = NDArray[np.float64]
 Metrics = dict[str, float | int]
@@ -36,8 +36,8 @@ BATCH = 16
 class Peaks:
     """Circles found in one view, the best first."""
 
-    places: NDArray[np.int64]  # (m, 2) px of the view, m <= circles
-    identities: NDArray[np.int64]  # (m,) 0, 1 and on, or the number of circles for none
+    places: NDArray[np.int64]  # (m, 2) px of the view
+    identities: NDArray[np.int64]  # (m,) 0, 1 and on, or the number of identities for none
     scores: Array  # (m,)
 
 
@@ -46,15 +46,15 @@ def scores_of(detection: Tensor) -> Tensor:
     return pixel_shuffle(torch.softmax(detection, 1)[:, :NO_PIXEL], 8)[:, 0]
 
 
-def decode(detection: Tensor, identity: Tensor) -> list[Peaks]:
-    """Circles of n views."""
+def decode(detection: Tensor, identity: Tensor, most: int) -> list[Peaks]:
+    """Circles of n views, at most so many in each."""
     scores = scores_of(detection)
     kinds = identity.argmax(1).repeat_interleave(8, 1).repeat_interleave(8, 2)
     best = max_pool2d(scores[:, None], 2 * RADIUS + 1, 1, RADIUS)[:, 0]
     result = []
     for view, kind, peak in zip(scores, kinds, (scores == best) & (scores > SCORE), strict=True):
         v, u = torch.nonzero(peak, as_tuple=True)
-        order = torch.argsort(view[v, u], descending=True, stable=True)[: identity.shape[1] - 1]
+        order = torch.argsort(view[v, u], descending=True, stable=True)[:most]
         v, u = v[order], u[order]
         result.append(Peaks(torch.stack([u, v], 1).numpy(), kind[v, u].numpy(), view[v, u].numpy()))
     return result
@@ -65,14 +65,20 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
     """Figures of a detector.
 
     `recall`: of circles seen well enough, those found within 4 px with the right identity, and for each identity; `all_three`: of
-    views that show the whole target, those with all circles right, and by the white's digital number and by blur; errors of place
+    targets that a view shows whole, those with all circles right, and by the white's digital number and by blur; errors of place
     against the exact coarse place, in px of the view and of full resolution (along u); `wrong`: of found circles in views
     of a target, those that are none of it or have another's identity; `false_per_empty_view`: circles found where there is none.
+    Of targets whose identities aren't learnt, any will do.
     """
     network.eval()
-    peaks = [found for k in range(0, len(views), BATCH) for found in decode(*network(_grey(views.images[k : k + BATCH])))]
+    most = views.centres.shape[1]
+    answers = (network(_grey(views.images[k : k + BATCH])) for k in range(0, len(views), BATCH))
+    peaks = [found for detection, identity in answers for found in decode(detection, identity, most)]
     errors = np.stack(
-        [_errors(found, centres / scale) for found, centres, scale in zip(peaks, views.centres, views.scale, strict=True)]
+        [
+            _errors(found, centres / scale, names)
+            for found, centres, scale, names in zip(peaks, views.centres, views.scale, views.identity, strict=True)
+        ]
     )
     named, anyhow = errors[:, 0], errors[:, 1]  # (n, circles) px, to the circle found by that name, and by any
     places = (views.centres + 0.5) / views.scale[:, None] - 0.5
@@ -80,18 +86,20 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
         held = ((places >= -0.5) & (places < np.array(views.images.shape[:0:-1]) - 0.5)).all(-1)
     counts = (views.visible >= SEEN) & held  # beyond the view there is nothing to find
     right, located = named <= FOUND, anyhow <= FOUND
-    whole = counts.all(1) & views.inside.all(1)
-    all_three = right.all(1)
+    targets = [views.body == number for number in range(int(views.body.max()) + 1)]
+    whole = np.stack([(its & counts & views.inside).sum(1) == np.maximum(its.sum(1), 1) for its in targets], 1)
+    all_three = np.stack([(right | ~its).all(1) for its in targets], 1)
     hits = named[counts & right]
     full = hits * views.scale[0, 0]
     found = np.array([len(one.places) for one in peaks])
     empty = (views.visible <= HIDDEN).all(1)
+    by_name = {k: counts & (views.identity == k) for k in range(int(views.identity.max()) + 1)}
     figures: Metrics = {
         "views": len(views),
         "recall": _share(right[counts]),
         "identity_accuracy": _share(right[counts & located]),
-        **{f"recall_c{k}": _share(right[:, k][counts[:, k]]) for k in range(right.shape[1])},
-        **{f"identity_accuracy_c{k}": _share(right[:, k][(counts & located)[:, k]]) for k in range(right.shape[1])},
+        **{f"recall_c{k}": _share(right[its]) for k, its in by_name.items()},
+        **{f"identity_accuracy_c{k}": _share(right[its & located]) for k, its in by_name.items()},
         "place_median_px": float(np.median(hits)) if len(hits) else math.nan,
         "place_median_full_px": float(np.median(full)) if len(full) else math.nan,
         "place_95_full_px": float(np.percentile(full, 95)) if len(full) else math.nan,
@@ -101,10 +109,11 @@ def measure_detector(network: nn.Module, views: Views) -> Metrics:
         "false_per_empty_view": _share_of(found[empty].sum(), empty.sum()),
         "empty_views": int(empty.sum()),
     }
-    blur = views.blur.max(1)
-    for values, classes in ((views.white, BRIGHT), (blur, BLUR)):
-        for name, (least, most) in classes.items():
-            figures[f"all_three_{name}"] = _share(all_three[whole & (values >= least) & (values < most)])
+    blur = np.stack([np.where(its, views.blur, 0.0).max(1) for its in targets], 1)
+    white = np.repeat(views.white[:, None], len(targets), axis=1)
+    for values, classes in ((white, BRIGHT), (blur, BLUR)):
+        for name, (least, end) in classes.items():
+            figures[f"all_three_{name}"] = _share(all_three[whole & (values >= least) & (values < end)])
     return figures
 
 
@@ -153,12 +162,12 @@ def _grey(images: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(images).float()[:, None] / 255
 
 
-def _errors(found: Peaks, places: Array) -> Array:
+def _errors(found: Peaks, places: Array, names: NDArray[np.int64]) -> Array:
     """Distances (2, circles) of true coarse places to the nearest circle found with the right identity, and to that with any."""
     result = np.full((2, len(places)), np.inf)
-    for k, place in enumerate(places):
+    for k, (place, name) in enumerate(zip(places, names, strict=True)):
         distances = np.linalg.norm(found.places - place, axis=1)
-        result[0, k] = min(distances[found.identities == k], default=np.inf)
+        result[0, k] = min(distances[(found.identities == name) | (name == UNNAMED)], default=np.inf)
         result[1, k] = min(distances, default=np.inf)
     return np.nan_to_num(result, nan=np.inf)
 

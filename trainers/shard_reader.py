@@ -6,7 +6,7 @@ by its place: the same images either way, whatever the order.
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -22,14 +22,13 @@ from recon.files import json_text, tar_members
 from recon.model import circle_layout
 from recon.model.rig import Target
 from trainers.shard_truth import (
+    UNNAMED,
     Array,
     Count,
     Facts,
     Known,
     PatchedTruth,
-    PatchTruth,
     SampleTruth,
-    ViewTruth,
     ellipses_in_patches,
     facts,
     identity,
@@ -48,7 +47,10 @@ Tell = Callable[[int], None]  # of how many samples were read, or images decoded
 
 @dataclass(frozen=True)
 class Views:
-    """Views of n samples, two each, and their ground truth. Without a target centres are NaN and the rest is 0."""
+    """Views of n samples, two each, and their ground truth. Of a target that isn't there centres are NaN and the rest is 0.
+
+    The circles are those of the probe's target, then those of further bodies' targets.
+    """
 
     images: Images  # (2 n, 240, 320)
     scale: Array  # (2 n, 2) px of full resolution a px of a view, along u and v
@@ -56,7 +58,9 @@ class Views:
     visible: Array  # (2 n, circles) fraction of each outer disc that is seen
     inside: NDArray[np.bool_]  # (2 n, circles) whether the whole disc is in the image
     blur: Array  # (2 n, circles) px of full resolution
-    white: Array  # (2 n,) digital number of the target's white
+    identity: NDArray[np.int64]  # (2 n, circles) 0 of c0 and on; UNNAMED of targets of another kind than the probe's
+    body: NDArray[np.int64]  # (2 n, circles) whose a circle is: 0 of the probe's target, then of further ones; -1 of none
+    white: Array  # (2 n,) digital number of the targets' white, the brightest's
     sample: NDArray[np.int64]  # (2 n,) which sample a view is of
 
     def __len__(self) -> int:
@@ -65,7 +69,7 @@ class Views:
     @property
     def present(self) -> NDArray[np.bool_]:
         """(2 n,) whether there is a target before the camera."""
-        return np.isfinite(self.centres).all((1, 2))
+        return np.isfinite(self.centres).all(2).any(1)
 
 
 @dataclass(frozen=True)
@@ -96,39 +100,84 @@ def read_views(folders: Sequence[Path], tell: Tell = lambda count: None, partial
         In one line, where a set is missing, damaged or, unless `partial`, incomplete, or a sample is in two of them. Damage of
         images shows when they are decoded.
     """
-    circles = circles_of(folders)
-    index = _read(
-        folders, [f"cam{k}.png" for k in VIEWS], SampleTruth, lambda views: facts(views, circles), circles, tell, partial
-    )
-    known = Facts(*index.columns)
-    return Views(
-        index.images(slice(None), _view, VIEW, 1),
-        known.size / VIEW,
-        known.centres,
-        known.visible,
-        known.inside,
-        known.blur,
-        known.white,
-        np.arange(len(known.white)) // len(VIEWS),
-    )
+    kind, circles = kind_of(folders), circles_of(folders)
+
+    def convert(samples: Sequence[SampleTruth]) -> tuple[Array, ...]:
+        return np.array([view.camera.size for sample in samples for view in sample.views], float), *facts(samples, circles)
+
+    parts = []
+    for index in _read(folders, [f"cam{k}.png" for k in VIEWS], SampleTruth, convert, circles, tell, partial):
+        size, known = index.columns[0], Facts(*index.columns[1:])
+        n = len(size)
+        targets = [(kind, circles), *index.others.values()]
+        identity = [np.arange(count) if one == targets[0] else np.full(count, UNNAMED) for one in targets for count in one[1:]]
+        body = np.repeat(np.arange(len(targets)), [count for _, count in targets])
+        parts.append(
+            Views(
+                index.images(slice(None), _view, VIEW, 1),
+                size / VIEW,
+                known.centres,
+                known.visible,
+                known.inside,
+                known.blur,
+                np.tile(np.concatenate(identity), (n, 1)),
+                np.tile(body, (n, 1)),
+                known.white.max(axis=1),
+                np.arange(n) // len(VIEWS),
+            )
+        )
+    return joined(parts)
 
 
 def read_patches(folders: Sequence[Path], tell: Tell = lambda count: None, partial: bool = False) -> Patches:
     """All patches of every sample, with their masks; otherwise as `read_views`."""
     circles = circles_of(folders)
 
-    def convert(views: Sequence[PatchTruth]) -> tuple[Array, ...]:
-        return *facts(views, circles), ellipses_in_patches(views, circles)
+    def convert(samples: Sequence[PatchedTruth]) -> tuple[Array, ...]:
+        return *facts(samples, circles), ellipses_in_patches(samples, circles)
 
     ends = [f"{kind}{k}.png" for kind in ("patches", "masks") for k in VIEWS]
-    index = _read(folders, ends, PatchedTruth, convert, circles, tell, partial)
-    *known, ellipses = index.columns
-    visible, white = Facts(*known).visible.reshape(-1), np.repeat(Facts(*known).white, circles)
-    images, masks = (
-        index.images(which, functools.partial(_patches, circles=circles), (PATCH, PATCH), circles)
-        for which in (slice(len(VIEWS)), slice(len(VIEWS), None))
-    )
-    return Patches(images, masks, ellipses, visible, white, np.arange(len(white)) // (circles * len(VIEWS)))
+    parts = []
+    for index in _read(folders, ends, PatchedTruth, convert, circles, tell, partial):
+        *known, ellipses = index.columns
+        visible, white = Facts(*known).visible, Facts(*known).white
+        count = visible.shape[1]
+        images, masks = (
+            index.images(which, functools.partial(_patches, circles=count), (PATCH, PATCH), count)
+            for which in (slice(len(VIEWS)), slice(len(VIEWS), None))
+        )
+        sample = np.arange(white.size) // (count * len(VIEWS))
+        parts.append(Patches(images, masks, ellipses.reshape(-1, 5), visible.ravel(), white.ravel(), sample))
+    return joined(parts)
+
+
+def joined(parts: Sequence[Some]) -> Some:
+    """Samples of all parts, one after the other; their images may lie in files of any kind."""
+    circles = max(part.centres.shape[1] if isinstance(part, Views) else 0 for part in parts)
+    first, *others = (_with_circles(part, circles) for part in parts)
+    for part in others:
+        columns = {field.name: _stacked(getattr(first, field.name), getattr(part, field.name)) for field in fields(first)}
+        first = replace(first, **columns | {"sample": np.append(first.sample, part.sample + first.sample[-1] + 1)})
+    return first
+
+
+def _with_circles(data: Some, circles: int) -> Some:
+    """The same; views with columns of that many circles, the further ones those of targets that aren't there."""
+    if isinstance(data, Patches):
+        return data
+    nothing = {"centres": np.nan, "visible": 0.0, "inside": False, "blur": 0.0, "identity": UNNAMED, "body": -1}
+    columns = {}
+    for name, value in nothing.items():
+        some = getattr(data, name)
+        more = np.full_like(some, value, shape=(len(some), circles - some.shape[1], *some.shape[2:]))
+        columns[name] = np.concatenate([some, more], axis=1)
+    return replace(data, **columns)
+
+
+def _stacked(one: StoredImages | np.ndarray, other: StoredImages | np.ndarray) -> StoredImages | np.ndarray:
+    if isinstance(one, StoredImages) and isinstance(other, StoredImages):
+        return one.followed_by(other)
+    return np.concatenate([one, other])
 
 
 def has_patches(folder: Path) -> bool:
@@ -193,11 +242,12 @@ def _decoded(images: StoredImages, tell: Tell) -> Grey:
 
 
 class _Index(NamedTuple):
-    """What is known of all samples without their images."""
+    """What is known of all samples of a folder without their images."""
 
     shards: tuple[Path, ...]
     places: NDArray[np.int64]  # (samples, members, 3) as of `StoredImages`
     columns: list[Array]
+    others: Mapping[str, tuple[str, int]]  # kind and number of circles of further bodies' targets
 
     def images(self, which: slice, decode: Decode, size: tuple[int, int], pieces: int) -> StoredImages:
         """Images in some of the members."""
@@ -207,9 +257,11 @@ class _Index(NamedTuple):
 
 
 class _Shard(NamedTuple):
+    path: Path
     places: NDArray[np.int64]  # (samples, members, 3)
     identities: NDArray[np.uint64]  # (samples,)
     columns: Sequence[Array]
+    others: Mapping[str, tuple[str, int]]
 
 
 def _read(
@@ -220,25 +272,37 @@ def _read(
     circles: int,
     tell: Tell,
     partial: bool,
-) -> _Index:
-    """Read the truth of all samples, and find the members with these ends of their names."""
-    shards: list[Path] = []
-    parts: list[_Shard] = []
+) -> list[_Index]:
+    """Read the truth of all samples, folder by folder, and find the members with these ends of their names."""
+    shards: list[_Shard] = []
+    indices: list[_Index] = []
     count = 0
     for folder in folders:
-        before = count
-        for shard in _shards_of(folder):
-            parts.append(_scan(shard, len(shards), ends, model, convert, circles))
-            shards.append(shard)
-            count += len(parts[-1].identities)
+        before, own = count, list[_Shard]()
+        for path in _shards_of(folder):
+            own.append(_scan(path, len(own), ends, model, convert, circles))
+            if own[-1].others != own[0].others:
+                raise InputError(f"{path}: {_other_bodies(own[0].others, own[-1].others)} in {own[0].path}")
+            count += len(own[-1].identities)
             tell(count)
         expected = None if partial else _settings(folder).samples
         if expected is not None and expected != count - before:
             found = f"found {count - before} in shards; partial=true takes these"
             raise InputError(f"{folder}: expected {expected} samples as of dataset.json, {found}")
-    _check_apart(shards, parts)
-    columns = [np.concatenate(column) for column in zip(*(part.columns for part in parts), strict=True)]
-    return _Index(tuple(shards), np.concatenate([part.places for part in parts]), columns)
+        columns = [np.concatenate(column) for column in zip(*(shard.columns for shard in own), strict=True)]
+        places = np.concatenate([shard.places for shard in own])
+        indices.append(_Index(tuple(shard.path for shard in own), places, columns, own[0].others))
+        shards += own
+    _check_apart(shards)
+    return indices
+
+
+def _other_bodies(expected: Mapping[str, tuple[str, int]], found: Mapping[str, tuple[str, int]]) -> str:
+    one, other = (
+        ", ".join(f"{short(name)} of {count} circles" for name, (_, count) in some.items()) or "none"
+        for some in (expected, found)
+    )
+    return f"bodies: expected the same in all samples, found {other}, and {one}"
 
 
 def _shards_of(folder: Path) -> list[Path]:
@@ -250,7 +314,7 @@ def _shards_of(folder: Path) -> list[Path]:
 
 
 def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth], convert: Callable, circles: int) -> _Shard:
-    views: list[ViewTruth] = []
+    truths: list[SampleTruth] = []
     places: list[list[tuple[int, int, int]]] = []
     identities: list[int] = []
     for key, members in tar_members.samples(path):
@@ -264,22 +328,24 @@ def _scan(path: Path, number: int, ends: Sequence[str], model: type[SampleTruth]
             if view.circles not in (None, circles):
                 found = f"{view.circles}; dataset.json beside it names the target, rig.target.kind"
                 raise InputError(f"{path}: {key}.json: expected {circles} circles a view, found {found}")
-        views.extend(truth.views)
+        truths.append(truth)
+        if truth.others != truths[0].others:
+            raise InputError(f"{path}: {key}.json: {_other_bodies(truths[0].others, truth.others)} before it")
         places.append([(number, members[end].offset, members[end].size) for end in ends])
         identities.append(identity(truth, content))
     if not places:
         raise InputError(f"{path}: expected samples, found none in it; was it cut short? Remove it, and make its samples again")
-    return _Shard(np.array(places, np.int64), np.array(identities, np.uint64), convert(views))
+    return _Shard(path, np.array(places, np.int64), np.array(identities, np.uint64), convert(truths), truths[0].others)
 
 
-def _check_apart(shards: Sequence[Path], parts: Sequence[_Shard]) -> None:
+def _check_apart(shards: Sequence[_Shard]) -> None:
     """Refuse samples that are there twice: some would be trained with and validated with."""
-    identities = np.concatenate([part.identities for part in parts])
-    of_shard = np.repeat(np.arange(len(parts)), [len(part.identities) for part in parts])
+    identities = np.concatenate([shard.identities for shard in shards])
+    of_shard = np.repeat(np.arange(len(shards)), [len(shard.identities) for shard in shards])
     order = np.argsort(identities, kind="stable")
     same = np.flatnonzero((np.diff(identities[order]) == 0) & (identities[order][1:] > 0))
     if len(same):
-        one, other = (shards[of_shard[order[place]]] for place in (same[0], same[0] + 1))
+        one, other = (shards[of_shard[order[place]]].path for place in (same[0], same[0] + 1))
         raise InputError(
             f"{other}: expected samples that are in no other part, found {len(same)} in two, here and in {one} the first; "
             "parts of one set need ranges apart (first, samples), or seeds of their own"

@@ -5,11 +5,13 @@ OUT/dataset.json; docs/training.md says what is in them. About six stereo sample
 it compiles. A run that was stopped goes on where it was when started again; the same seed gives the same bytes, on any engine.
 Several machines make ranges of one set, each into a folder of its own from its sample `first` on; `sonotwin train data=[a,b]`
 takes them together. A second run into one folder is refused while the first is at work.
+With a rig that has further bodies, such as three_bodies, samples hold them too, each with its truth.
 
     sonotwin dataset out=outputs/data samples=3000 engine.workers=2
     sonotwin dataset out=outputs/test samples=1000 seed=1
     sonotwin dataset out=outputs/more first=3000 samples=3000
     sonotwin dataset out=outputs/full samples=20 frames=full
+    sonotwin dataset out=outputs/bodies rig=three_bodies
 """
 
 from contextlib import closing

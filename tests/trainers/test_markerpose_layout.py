@@ -34,7 +34,7 @@ def theirs(exported, tmp_path):
 def labels_of(views: Views) -> tuple:
     scale = torch.from_numpy(views.scale)
     places = seen_in_view(torch.from_numpy(views.centres), scale) + label_offset(scale)[:, None]
-    found = labels(places, torch.from_numpy(views.visible), (320, 240))
+    found = labels(places, torch.from_numpy(views.visible), torch.from_numpy(views.identity), (320, 240))
     return found.pixel, found.identity
 
 

@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")  # the folder's other tests need it, and so
 
 from recon.errors import InputError
 from trainers.shard_reader import Patches, as_fits, bytes_decoded, chosen, in_memory, read_patches, read_views, split
+from trainers.shard_truth import UNNAMED
 
 
 def rewritten(folder, change):
@@ -42,6 +43,71 @@ def test_views_and_their_truth_are_read_in_order(data_set):
             bright.append(image[int(v), int(u)])  # the white hole of c0
             dark.append(image[int(v), int(u) + 7])  # its black
     assert len(dark) > 30 and np.mean(bright) > np.mean(dark) + 80
+
+
+def test_circles_of_further_bodies_stand_beside_the_probes(data_set, set_of_bodies):
+    """Their names are the probe's where the target is of its kind; a set without them has none of them."""
+    views = in_memory(read_views([set_of_bodies, data_set]))
+    assert views.centres.shape == (40 + 48, 10, 2)
+    assert (views.identity[:40] == [0, 1, 2, 0, 1, 2, *[UNNAMED] * 4]).all()
+    assert (views.body[:40] == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2]).all()
+    alone = in_memory(read_views([data_set]))
+    for name in ("centres", "visible", "inside", "blur", "identity", "body"):
+        np.testing.assert_array_equal(getattr(views, name)[40:, :3], getattr(alone, name))
+    assert np.isnan(views.centres[40:, 3:]).all() and not views.visible[40:, 3:].any() and (views.body[40:, 3:] == -1).all()
+    assert (np.isfinite(views.centres[:40, 3:]).all((1, 2)) == (views.sample[:40] % 5 != 4)).all()
+    assert (views.present[:40] == ((views.sample[:40] % 5 != 4) | (views.sample[:40] % 6 != 5))).all()
+    for image, centres, scale in zip(views.images[:40], views.centres[:40, 3:], views.scale[:40], strict=True):
+        for u, v in np.rint(centres / scale)[np.isfinite(centres).all(1)].astype(int):
+            hole, ring = image[v, u], image[max(v - 5, 0), u]
+            assert int(hole) > int(ring) + 60  # px of the view: holes have a radius of 3, discs of 7 or more
+
+
+def test_patches_of_further_bodies_have_their_masks(data_set, set_of_bodies):
+    patches = in_memory(read_patches([data_set, set_of_bodies]))
+    assert len(patches) == 144 + 20 * 2 * 10 and (patches.sample[144:] == 24 + np.repeat(np.arange(20), 20)).all()
+    rows, columns = np.indices((120, 120))
+    near = np.abs(patches.ellipses[:, :2] - 59.5).max(1) < 1
+    near[:144] = False
+    assert near.sum() > 250
+    for mask, ellipse in zip(patches.masks[near], patches.ellipses[near], strict=True):
+        inside = mask > 0
+        assert np.abs([columns[inside].mean() - ellipse[0], rows[inside].mean() - ellipse[1]]).max() < 0.3
+    assert not patches.masks[np.isnan(patches.ellipses[:, 0])].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda truth: truth.pop("bodies"),
+            "bodies: expected the same in all samples, found none, and needle of 3 circles, tray",
+        ),
+        (
+            lambda truth: truth["bodies"].update(tray=truth["bodies"]["needle"]),
+            "found needle of 3 circles, tray of 3 circles, and",
+        ),
+        (lambda truth: truth["bodies"]["tray"]["views"][0].update(patch_origins=[[0, 0]] * 3), "patch"),
+        (lambda truth: truth["bodies"]["tray"].pop("kind"), r"bodies\.tray\.kind: expected a value"),
+        (lambda truth: truth.update(bodies=[1]), "bodies: expected"),
+        (lambda truth: truth["bodies"]["needle"]["views"].pop(), r"bodies\.needle\.views"),
+        (lambda truth: truth["bodies"]["needle"]["views"][1].update(visible=[2.0] * 3), r"bodies\.needle\.views\.1\.visible\.0"),
+    ],
+)
+def test_damaged_truth_of_bodies_is_named(set_of_bodies, tmp_path, change, message):
+    def changed(name, content):
+        if not name.endswith("-00000003.json"):
+            return content
+        truth = json.loads(content)
+        change(truth)
+        return json.dumps(truth).encode()
+
+    folder = shutil.copytree(set_of_bodies, tmp_path / "set")
+    rewritten(folder, changed)
+    for read in (read_views, read_patches):
+        with pytest.raises(InputError, match=rf"shard-00000\.tar: 0-00000003\.json: .*{message}") as caught:
+            read([folder])
+        assert str(caught.value).isprintable() and len(str(caught.value)) < 600
 
 
 def test_masks_lie_where_their_ellipses_are(data_set):

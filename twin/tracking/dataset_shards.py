@@ -23,27 +23,25 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from recon.errors import InputError, brief, one_line
 from recon.files import atomic, json_text, tar_members
+from recon.geometry.camera import Camera
 from recon.model.rig import Rig
 from twin.engine import Engine, results
 from twin.session import first_difference
 from twin.shooting import Quality
-from twin.tracking.mesh_bank import build_bank
+from twin.tracking.body_samples import with_bodies
+from twin.tracking.mesh_bank import build_bodies
 from twin.tracking.rendered_views import Sample, render_full, render_sketches, render_views
-from twin.tracking.samples import Take, draw
+from twin.tracking.samples import Held, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.target_truth import ViewTruth, disc_masks
 
 INDEX, SETTINGS = "index.parquet", "dataset.json"
 BY = "dataset"  # who writes
 VERSION = 2  # 1 had keys without the seed, and began with sample 0
+VERSION_OF_BODIES = 3  # of a rig with further bodies; 2 showed the probe alone
 BATCH = 5  # samples traced in one launch; doesn't change them
 ROWS = 10_000  # of the index that are written at once
-COLUMNS = pa.schema(
-    [("seed", pa.int64()), ("k", pa.int64()), ("shard", pa.string()), ("present", pa.bool_())]
-    + [("body", pa.int64()), ("surroundings", pa.int64()), ("gain", pa.float64())]
-    + [(f"{name}_{i}", pa.float64()) for name in ("white_dn", "blur_px", "visible") for i in (1, 2)]
-    + [(f"inside_{i}", pa.bool_()) for i in (1, 2)]
-)
+OF_VIEWS = {"white_dn": pa.float64(), "blur_px": pa.float64(), "visible": pa.float64(), "inside": pa.bool_()}  # index columns
 LEFTOVER = re.compile(r"\.shard-(\d+)\..*\.(tar|lock)")  # perhaps, as of recon.files.atomic
 MADE_ANEW = "delete the file, and the same command makes it anew"
 PNG = [cv2.IMWRITE_PNG_COMPRESSION, 4]
@@ -63,6 +61,11 @@ class Settings(BaseModel):
     first: int = 0
     samples: int
     shard: int  # samples a shard
+
+    @property
+    def version(self) -> int:
+        """Version of the data set."""
+        return VERSION_OF_BODIES if self.rig.bodies else VERSION
 
     def shards(self) -> range:
         """Numbers of the shards."""
@@ -108,7 +111,8 @@ def prepare(place: Place, settings: Settings) -> list[int]:
         If the folder holds a data set of other settings or of another version, or something else.
     """
     told = place.folder / SETTINGS
-    written = {"version": VERSION, **settings.model_dump(mode="json")}
+    unused = {} if settings.rig.bodies else {"ranges": {"bodies"}}
+    written = {"version": settings.version, **settings.model_dump(mode="json", exclude=unused)}
     if told.exists():
         _check_same(told, written)
     atomic.check_filled_folder(place.folder, BY)
@@ -130,10 +134,11 @@ def _check_same(told: Path, written: Mapping[str, Any]) -> None:
         there = Written.model_validate(found)
     except ValidationError as error:
         raise InputError(f"{told}: {one_line(error)}; expected a data set's settings, or another out") from None
-    if there.version != VERSION:
-        keys = ", whose keys lack the seed" if there.version < VERSION else ""
+    if there.version != (version := written["version"]):
+        older = {1: ", whose keys lack the seed", 2: ", which shows the probe alone"} if there.version < version else {}
         raise InputError(
-            f"{told}: version: expected {VERSION}, found {there.version}{keys}; it can be trained with as it is, "
+            f"{told}: version: expected {version}, found {there.version}{older.get(there.version, '')}; "
+            "it can be trained with as it is, "
             "but gets no more samples: choose another out, with first=... for those that come after its own"
         )
     if there.samples > written["samples"]:
@@ -175,12 +180,13 @@ def write_shard(place: Place, settings: Settings, number: int) -> int:
     """Render a shard's samples and write them; gives their number."""
     import webdataset  # with torch, where it is installed: seconds that a refusal and the help do without
 
-    bank = build_bank(settings.rig.target, settings.ranges.variants, settings.seed)
+    bank = build_bodies(settings.rig, settings.ranges.variants, settings.seed)
     samples = settings.samples_of(number)
     shard = atomic.listed_file(place.folder, place.shard(number).name, BY)
     with shard as path, webdataset.TarWriter(str(path), encoder=False, mtime=0, mode=0o644) as tar:
         for first in range(samples.start, samples.stop, BATCH):
-            takes = [draw(settings.ranges, settings.rig, settings.seed, k) for k in samples if first <= k < first + BATCH]
+            drawn = [draw(settings.ranges, settings.rig, settings.seed, k) for k in samples if first <= k < first + BATCH]
+            takes = [with_bodies(take, bank, settings.ranges, settings.rig, settings.seed) for take in drawn]
             rendered = RENDER[settings.frames](bank, settings.rig, takes, settings.quality, settings.seed)
             for take, frames in zip(takes, rendered, strict=True):
                 tar.write({"__key__": settings.key(take.k), **members(take, frames, settings)})
@@ -191,30 +197,25 @@ def members(take: Take, frames: Sample, settings: Settings) -> dict[str, bytes]:
     """A sample's files."""
     files = {f"cam{number}.png": _png(view) for number, view in zip((1, 2), frames.views, strict=True)}
     if settings.frames == "views":
-        for number, patches, truth in zip((1, 2), frames.patches, frames.truth, strict=True):
-            masks = np.zeros_like(patches)
-            if take.present:
-                masks = disc_masks(truth.ellipses, truth.patch_origins, patches.shape[-1])
+        for number, patches in zip((1, 2), frames.patches, strict=True):
+            truths = [views[number - 1] for views in frames.bodies.values()]
+            masks = np.concatenate([disc_masks(truth.ellipses, truth.patch_origins, patches.shape[-1]) for truth in truths])
             files[f"patches{number}.png"] = _png(np.concatenate(patches))
             files[f"masks{number}.png"] = _png(np.concatenate(masks))
-    return {**files, "json": json.dumps(truth_record(take, frames, settings.seed)).encode()}
+    return {**files, "json": json.dumps(truth_record(take, frames, settings)).encode()}
 
 
 def _png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image, PNG)[1].tobytes()
 
 
-def truth_record(take: Take, frames: Sample, seed: int) -> dict:
+def truth_record(take: Take, frames: Sample, settings: Settings) -> dict:
     """Ground truth of a sample, as in docs/training.md."""
-    motion = take.motion
-    return {
+    probe, *others = take.held
+    record = {
         "k": take.k,
-        "seed": seed,
-        "present": take.present,
-        "world_from_target": motion.world_from_target.tolist() if take.present else None,
-        "shift_mm": motion.shift_mm.tolist() if take.present else None,
-        "turn_rad": motion.turn_rad.tolist() if take.present else None,
-        "body": take.body,
+        "seed": settings.seed,
+        **_held_record(take.held[probe]),
         "surroundings": take.surroundings,
         "exposure": {"white_dn": take.white_dn, "gain": take.gain},
         "light": {
@@ -222,12 +223,42 @@ def truth_record(take: Take, frames: Sample, seed: int) -> dict:
             "ambient": take.lighting.ambient,
             "projector": take.lighting.projector.tolist(),
         },
-        "views": [_view_record(truth, take.present) for truth in frames.truth],
+        "views": [_camera_record(truth.camera) | _view_record(truth, take.present) for truth in frames.truth],
+    }
+    bodies = {
+        name: {
+            "kind": settings.rig.bodies[name].kind,
+            **_held_record(take.held[name]),
+            "views": [_view_record(truth, take.held[name].present) for truth in frames.others[name]],
+        }
+        for name in others
+    }
+    return record | ({"bodies": bodies} if bodies else {})
+
+
+def _held_record(held: Held) -> dict:
+    motion = held.motion
+    return {
+        "present": held.present,
+        "world_from_target": motion.world_from_target.tolist() if held.present else None,
+        "shift_mm": motion.shift_mm.tolist() if held.present else None,
+        "turn_rad": motion.turn_rad.tolist() if held.present else None,
+        "body": held.body,
+    }
+
+
+def _camera_record(camera: Camera) -> dict:
+    return {
+        "camera": {
+            "size": list(camera.size),
+            "matrix": camera.matrix.tolist(),
+            "distortion": camera.distortion.tolist(),
+            "camera_from_world": camera.camera_from_world.tolist(),
+        }
     }
 
 
 def _view_record(truth: ViewTruth, present: bool) -> dict:
-    camera = truth.camera
     known = {
         "centres": truth.centres.tolist(),
         "ellipses": truth.ellipses.tolist(),
@@ -235,12 +266,6 @@ def _view_record(truth: ViewTruth, present: bool) -> dict:
         "white_dn": None if np.isnan(truth.white_dn) else truth.white_dn,
     }
     return {
-        "camera": {
-            "size": list(camera.size),
-            "matrix": camera.matrix.tolist(),
-            "distortion": camera.distortion.tolist(),
-            "camera_from_world": camera.camera_from_world.tolist(),
-        },
         **(known if present else dict.fromkeys(known)),
         "visible": truth.visible.tolist(),
         "inside": truth.inside.tolist(),
@@ -267,22 +292,46 @@ def truths(path: Path) -> Iterator[dict]:
 def write_index(place: Place, settings: Settings) -> None:
     """Index table, a row a sample: its place, and the quantities by which samples are chosen."""
     rows = (_index_row(place.shard(number), record) for number in settings.shards() for record in truths(place.shard(number)))
-    with atomic.listed_file(place.folder, INDEX, BY) as path, pq.ParquetWriter(path, COLUMNS) as table:
+    columns = _index_columns(settings.rig)
+    with atomic.listed_file(place.folder, INDEX, BY) as path, pq.ParquetWriter(path, columns) as table:
         while some := list(islice(rows, ROWS)):  # not all at once: there may be millions
-            table.write_table(pa.Table.from_pylist(some, COLUMNS))
+            table.write_table(pa.Table.from_pylist(some, columns))
+
+
+def _index_columns(rig: Rig) -> pa.Schema:
+    """Columns of the sample and the probe, then of further bodies, with their names before them."""
+    sample = {"seed": pa.int64(), "k": pa.int64(), "shard": pa.string(), "present": pa.bool_(), "body": pa.int64()}
+    sample |= {"surroundings": pa.int64(), "gain": pa.float64()}
+    views = {f"{name}_{i}": kind for name, kind in OF_VIEWS.items() for i in (1, 2)}
+    others = {f"{body}_{name}": kind for body in rig.bodies for name, kind in ({"present": pa.bool_()} | views).items()}
+    return pa.schema({**sample, **views, **others})
 
 
 def _index_row(shard: Path, record: dict) -> dict:
     try:
-        views = list(enumerate(record["views"], 1))
         return {
-            **{name: record[name] for name in ("seed", "k", "present", "body", "surroundings")},
+            **{name: record[name] for name in ("seed", "k", "body", "surroundings")},
             "shard": shard.name,
             "gain": record["exposure"]["gain"],
-            **{f"white_dn_{i}": view["white_dn"] for i, view in views},
-            **{f"blur_px_{i}": max(view["blur_px"] or [0]) for i, view in views},
-            **{f"visible_{i}": min(view["visible"]) for i, view in views},
-            **{f"inside_{i}": all(view["inside"]) for i, view in views},
+            **_seen(record),
+            **{
+                f"{body}_{name}": value
+                for body, known in record.get("bodies", {}).items()
+                for name, value in _seen(known).items()
+            },
         }
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{shard}: expected the truth of samples made here, found other data ({error}); {MADE_ANEW}") from None
+
+
+def _seen(record: dict) -> dict:
+    """Columns of a target by its views."""
+    columns = {"present": record["present"]}
+    for i, view in enumerate(record["views"], 1):
+        columns |= {
+            f"white_dn_{i}": view["white_dn"],
+            f"blur_px_{i}": max(view["blur_px"] or [0]),
+            f"visible_{i}": min(view["visible"]),
+            f"inside_{i}": all(view["inside"]),
+        }
+    return columns

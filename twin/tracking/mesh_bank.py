@@ -4,7 +4,7 @@ A sample picks its variants by their places; nothing is built or torn down betwe
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import drjit as dr
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Rig, Target
-from scenes.handheld.body_look import any_stand, look_of
+from scenes.handheld.body_look import Stand, any_stand, look_of
 from scenes.handheld.handheld_assembly import held
 from scenes.handheld.mesh_parts import Merged, Part, merged
 from scenes.handheld.surroundings import Surroundings, surroundings
@@ -32,13 +32,14 @@ LIFT_MM = 0.2  # of the rays off the target's face
 
 @dataclass(frozen=True)
 class Bank:
-    """Two worlds, and where each variant stands in them."""
+    """Two worlds, and the place of each variant in them."""
 
     bodies: mi.Scene
     scenes: mi.Scene
     posters: mi.ShapePtr  # the shape of all sheets with prints, if any; its texture coordinates are mm on the sheet
     body_at: Array  # (n, 3) mm
     scene_at: Array
+    stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)  # of each variant of further bodies, by their names
 
 
 @lru_cache(maxsize=4)
@@ -53,10 +54,13 @@ def build_bank(target: Target, variants: int, seed: int) -> Bank:
 def build_bodies(rig: Rig, variants: int, seed: int) -> Bank:
     """Make variants of all of a rig's bodies : body n's are those from n times their number on; once in a process."""
     streams = [np.random.default_rng([seed, 1 << 32, kind]) for kind in range(2 + len(rig.bodies))]
-    bodies = [held(streams[0], rig.target) for _ in range(variants)]
+    bodies, stands = [held(streams[0], rig.target) for _ in range(variants)], {}
     for stream, (name, target) in zip(streams[2:], rig.bodies.items(), strict=True):
-        bodies += [look_of(name).parts(stream, target, any_stand(stream)) for _ in range(variants)]
-    return bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)])
+        stands[name] = []
+        for _ in range(variants):
+            stands[name].append(any_stand(stream))
+            bodies.append(look_of(name).parts(stream, target, stands[name][-1]))
+    return replace(bank_of(bodies, [surroundings(streams[1]) for _ in range(variants)]), stands=stands)
 
 
 def bank_of(bodies: Sequence[Sequence[Part]], around: Sequence[Surroundings]) -> Bank:

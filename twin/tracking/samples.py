@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model import circle_layout
-from recon.model.rig import PROBE, CameraDevice, Lens, Rig, Sensor
+from recon.model.rig import PROBE, CameraDevice, Lens, Rig, Sensor, Target
 from scenes.handheld.mesh_parts import SLOTS
 from twin.tracking.sampling_ranges import CameraRanges, DataRanges, LightRanges, PoseRanges, TargetRanges
 
@@ -122,12 +122,12 @@ class Take:
 
 
 def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
-    """Draw sample k of a data set."""
+    """Draw sample k of a data set: its probe, and what surrounds it; `body_samples` adds further bodies."""
     rng = np.random.default_rng([seed, k])
     cameras = _cameras(ranges.cameras, ranges.light, rig, rng)
     present = rng.random() >= ranges.pose.empty_share
     pose = _pose(ranges.pose, rig, cameras, rng)
-    motion = _motion(ranges.pose, pose, cameras[0].optics.camera(), rng)
+    motion = draw_motion(ranges.pose, pose, cameras[0].optics.camera(), rng)
     return Take(
         k=k,
         cameras=cameras,
@@ -139,7 +139,7 @@ def draw(ranges: DataRanges, rig: Rig, seed: int, k: int) -> Take:
         lighting=_lighting(ranges.light, pose, rng),
         surfaces=_surfaces(rng),
         texture_shift=rng.uniform(-500, 500, 3),
-        face=_print(ranges.target, rig, rng),
+        face=draw_print(ranges.target, rig.target, rng),
         white_dn=_white(ranges.light, rng),
         gain=_log_uniform(ranges.light.gain, rng),
         noise_seed=int(rng.integers(2**31)),
@@ -224,12 +224,13 @@ def _pose(ranges: PoseRanges, rig: Rig, cameras: tuple[CameraDevice, CameraDevic
         middle = views[0].rays(pixel) * distance
         pose = rigid.transform(facing(eyes - middle, ranges.tilt_deg, rng), np.zeros(3))
         pose[:3, 3] = middle - pose[:3, :3] @ middle_target
-        if anywhere or all(_within(view, middle) for view in views):
+        if anywhere or all(within(view, middle) for view in views):
             break
     return pose
 
 
-def _within(view: Camera, point: Array) -> bool:
+def within(view: Camera, point: Array) -> bool:
+    """Whether a view shows a point : (3,) mm, not next to its border."""
     pixel = view.project(point)
     return bool(np.all(pixel > MARGIN_PX) and np.all(pixel < np.array(view.size) - 1 - MARGIN_PX))
 
@@ -245,7 +246,8 @@ def facing(towards: Array, most_deg: float, rng: np.random.Generator) -> Array:
     return frame @ tilted.as_matrix()
 
 
-def _motion(ranges: PoseRanges, pose: Array, camera: Camera, rng: np.random.Generator) -> Motion:
+def draw_motion(ranges: PoseRanges, pose: Array, camera: Camera, rng: np.random.Generator) -> Motion:
+    """Motion of a body in a hand about a pose, as long in camera 1's image as the ranges have it."""
     still = rng.random() < ranges.still_share
     length_px = rng.uniform(0, ranges.blur_px[0]) if still else _log_uniform(ranges.blur_px, rng)
     path = length_px * pose[2, 3] / camera.matrix[0, 0]
@@ -311,9 +313,10 @@ def _surfaces(rng: np.random.Generator) -> Array:
     return np.array(rows)
 
 
-def _print(ranges: TargetRanges, rig: Rig, rng: np.random.Generator) -> Print:
+def draw_print(ranges: TargetRanges, target: Target, rng: np.random.Generator) -> Print:
+    """A print of a target, with flaws on some."""
     flawed = rng.random() < ranges.flaw_share
-    low, high = np.array([-14.0, -14.0]), circle_layout.extent(rig.target) + 14
+    low, high = np.array([-14.0, -14.0]), circle_layout.extent(target) + 14
     scratches, spots = np.zeros((SCRATCHES, 6)), np.zeros((SPOTS, 4))
     for scratch in scratches[: rng.integers(SCRATCHES + 1) * flawed]:
         start = rng.uniform(low, high)

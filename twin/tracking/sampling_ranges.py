@@ -75,6 +75,13 @@ class TargetRanges(Ranges):
     flaw_share: Share  # of targets with scratches, dirt and uneven ink
 
 
+class BodyRanges(Ranges):
+    """Ranges of the bodies of a rig that has several."""
+
+    absent_share: Share = 0.2  # of each body, the probe too, in samples that aren't empty
+    apart_mm: Positive = 120.0  # most, by which one in a hand is nearer to the cameras than the probe, or farther
+
+
 class DataRanges(Ranges):
     """All ranges of a data set."""
 
@@ -83,3 +90,4 @@ class DataRanges(Ranges):
     pose: PoseRanges
     light: LightRanges
     target: TargetRanges
+    bodies: BodyRanges = BodyRanges()

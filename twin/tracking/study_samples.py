@@ -5,7 +5,6 @@ Unlike a data set's, these leave nothing to chance but pose, body and surroundin
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from recon.model.rig import PROBE, Rig, Target
 from twin.tracking.mesh_bank import Bank, uncovered_share
 from twin.tracking.samples import LAMPS, SCRATCHES, SPOTS, Held, Lighting, Motion, Print, Take, draw, facing, scene_behind
 from twin.tracking.sampling_ranges import DataRanges
-from twin.tracking.target_truth import board_corners
+from twin.tracking.target_truth import board_corners, board_hulls, overlap
 from twin.working_range import working_range
 
 Array = NDArray[np.float64]
@@ -93,15 +92,13 @@ def bodies_take(
 
 def _apart(rig: Rig, blur_px: tuple[float, float], rng: np.random.Generator) -> dict[str, Motion] | None:
     """Motions of all bodies, whose boards keep apart in both views over the exposure; None if one finds no room."""
-    motions, taken = dict[str, Motion](), list[tuple[Array, ...]]()
+    motions, taken = dict[str, Motion](), list[tuple[NDArray[np.float32], ...]]()
     views = [device.optics.camera() for device in (rig.cam1, rig.cam2)]
     for name, target in rig.targets.items():
-        corners = board_corners(target)
         for _ in range(PLACE_TRIES):
             motion = _moving(rig, _pose(rig, target, rng), rng.uniform(*blur_px), rng)
-            ways = [np.concatenate([view.project(rigid.apply(motion.at(t), corners)) for t in (-0.5, 0.5)]) for view in views]
-            hulls = tuple(cv2.convexHull(np.float32(way)) for way in ways)
-            if not any(cv2.intersectConvexConvex(a, b)[0] > 0 for those in taken for a, b in zip(those, hulls, strict=True)):
+            hulls = board_hulls(motion, views, target)
+            if not any(overlap(hulls, others) for others in taken):
                 taken.append(hulls)
                 motions[name] = motion
                 break

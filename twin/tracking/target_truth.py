@@ -1,7 +1,9 @@
 """Ground truth of a target in a view: projected centres, outlines, blur, visibility."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +61,20 @@ def board_corners(target: Target) -> Array:
     half = np.array(target.board_mm) / 2
     middle = circle_layout.middle(target)[:2]
     return np.column_stack([middle + half * [[-1, -1], [1, -1], [1, 1], [-1, 1]], np.zeros(4)])
+
+
+def board_hulls(motion: Motion, cameras: Sequence[Camera], target: Target) -> tuple[NDArray[np.float32], ...]:
+    """Convex outlines : (n, 1, 2) px of the board over the exposure, one a view."""
+    corners = board_corners(target)
+    return tuple(
+        cv2.convexHull(np.float32(np.concatenate([camera.project(rigid.apply(motion.at(t), corners)) for t in (-0.5, 0.5)])))
+        for camera in cameras
+    )
+
+
+def overlap(one: Sequence[NDArray[np.float32]], other: Sequence[NDArray[np.float32]]) -> bool:
+    """Whether two boards, by `board_hulls`, overlap in a view."""
+    return any(cv2.intersectConvexConvex(a, b)[0] > 0 for a, b in zip(one, other, strict=True))
 
 
 def inside_share(ellipses: Array, size: tuple[int, int], rings: int = 24) -> Array:

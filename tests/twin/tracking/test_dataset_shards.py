@@ -13,7 +13,8 @@ import pytest
 import webdataset
 
 from recon.errors import InputError
-from tests.twin.tracking.takes import ranges, rig
+from sonotwin.cli import main
+from tests.twin.tracking.takes import ranges, rig, rig_of_three
 from twin.engine import Engine
 from twin.shooting import Quality
 from twin.tracking import dataset_shards
@@ -122,6 +123,85 @@ def test_what_is_in_a_shard(made):
                 v, u = np.nonzero(piece)
                 middle = np.array([u.mean(), v.mean()]) + view["patch_origins"][circle]
                 assert np.abs(middle - np.array(view["ellipses"][circle])[:2]).max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def made_of_bodies(tmp_path_factory):
+    """A data set of three bodies, in one shard, of which each is absent in a fifth of the samples."""
+    place, wanted = Place(tmp_path_factory.mktemp("data") / "bodies"), of_bodies()
+    list(generate(place, wanted, prepare(place, wanted), Engine()))
+    write_index(place, wanted)
+    return place
+
+
+def of_bodies(samples: int = 5, **changes) -> Settings:
+    return settings(samples, rig=rig_of_three(), shard=5, **changes)
+
+
+@pytest.mark.slow
+def test_bodies_are_in_all_that_is_written(made_of_bodies):
+    """Images, patches, masks, truth and index agree on which are there, and where."""
+    files, index = members(made_of_bodies.shard(0)), pq.read_table(made_of_bodies.folder / dataset_shards.INDEX).to_pylist()
+    compared, there = 0, set()
+    for row in index:
+        truth = json.loads(files[f"5-{row['k']:08d}.json"])
+        targets = {"": truth} | {f"{name}_": body for name, body in truth["bodies"].items()}
+        assert list(targets) == ["", "needle_", "patient_"] and truth["bodies"]["needle"]["kind"] == "three_circles"
+        for camera in (1, 2):
+            images = [cv2.imdecode(np.frombuffer(files[f"5-{row['k']:08d}.{kind}{camera}.png"], np.uint8), -1) for kind in KINDS]
+            assert all(image.shape == (9 * 120, 120) for image in images)
+            for number, (name, target) in enumerate(targets.items()):
+                view = target["views"][camera - 1]
+                assert row[f"{name}present"] == target["present"] == (view["centres"] is not None)
+                assert row[f"{name}visible_{camera}"] == min(view["visible"])
+                for circle in range(3):
+                    patch, mask = (image.reshape(9, 120, 120)[3 * number + circle] for image in images)
+                    assert target["present"] or not mask.any()
+                    if not mask.any() or view["visible"][circle] < 0.98:
+                        continue
+                    u, v, a, _, _ = view["ellipses"][circle]
+                    at = np.rint(np.array([v, u]) - view["patch_origins"][circle][::-1]).astype(int)
+                    hole = patch[at[0] - 2 : at[0] + 3, at[1] - 2 : at[1] + 3].mean()
+                    ring = patch[mask > 0][patch[mask > 0] < np.median(patch[mask > 0])].mean()
+                    assert hole > 1.3 * ring and abs(mask[at[0]].astype(bool).sum() - 2 * a) < a
+                    compared, there = compared + 1, there | {name}
+    assert compared > 12 and there == {"", "needle_", "patient_"}
+
+
+KINDS = ("patches", "masks")
+
+
+@pytest.mark.slow
+def test_a_sample_of_bodies_does_not_know_its_batch_or_range(made_of_bodies, monkeypatch, tmp_path):
+    monkeypatch.setattr(dataset_shards, "BATCH", 1)
+    part, wanted = Place(tmp_path / "set"), of_bodies(2, first=2)
+    list(generate(part, wanted, prepare(part, wanted), Engine()))
+    whole, there = members(made_of_bodies.shard(0)), members(part.shard(0))
+    assert {name.split(".")[0] for name in there} == {"5-00000002", "5-00000003"}
+    assert all(whole[name] == content for name, content in there.items())
+
+
+def test_a_set_that_shows_the_probe_alone_gets_no_bodies(tmp_path):
+    """As one of a rig with bodies was made once; one of a rig without them goes on, whatever is asked of bodies."""
+    place = Place(tmp_path / "set")
+    assert prepare(place, of_bodies()) == prepare(place, of_bodies()) == [0]
+    kept = place.folder / dataset_shards.SETTINGS
+    kept.write_text(json.dumps(json.loads(kept.read_text()) | {"version": 2}))
+    with pytest.raises(InputError, match="version: expected 3, found 2, which shows the probe alone; it can be trained with"):
+        prepare(place, of_bodies())
+    alone = Place(tmp_path / "alone")
+    prepare(alone, settings())
+    assert "bodies" not in json.loads((alone.folder / dataset_shards.SETTINGS).read_text())["ranges"]
+
+
+@pytest.mark.slow
+def test_networks_train_on_bodies(made_of_bodies, tmp_path):
+    pytest.importorskip("torch")
+    for network, count in (("detector", 10), ("segmenter", 90)):
+        out = tmp_path / network
+        assert main(["train", f"network={network}", f"data={made_of_bodies.folder}", f"out={out}", "steps=3", "batch=4"]) == 0
+        told = json.loads((out / "metrics.json").read_text())
+        assert told["steps"] == 3 and told["views" if network == "detector" else "patches"] == count // 5
 
 
 def test_the_index_has_a_row_a_sample(made):
