@@ -62,7 +62,8 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "fcal.xml", "probe/probe.yaml", "surface/surface.ply"}
-    | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires", "rows")},
+    | {"session", "tip/tip.yaml"}
+    | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires", "rows", "stylus")},
     "live.md": {"session", "morning"}
     | {f"outputs/live/{name}" for name in ("result/surface/surface.ply", "result/masses/scan", "capture/calibration/optics.yaml")}
     | {

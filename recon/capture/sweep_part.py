@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from recon.capture import manifest, probe_files, sweep_tables
 from recon.capture.images import Size, frame_file, read_image
 from recon.capture.manifest import MANIFEST, SCANNER, STAMPS, Purpose, image_name
-from recon.errors import Implausible, InputError
+from recon.errors import Implausible, InputError, did_you_mean
 from recon.files.regular import check_there
 from recon.model import pose_checks, tracks
 from recon.model.probe import ProbeCalibration
@@ -40,6 +40,15 @@ class SweepCapture:
     def clocked(self) -> bool:
         """Whether all B-scans have a time stamp, as of any sequence that could stand in place of this."""
         return True
+
+    def from_body(self, name: str) -> "SweepCapture":
+        """The same with poses `body_from_target` in the frame of a further body; InputError if it has none."""
+        if name not in self.bodies:
+            there = ", ".join(self.bodies) or "none: `sonotwin track` finds those of rig.bodies"
+            raise InputError(
+                f"{self.name}: body: expected one of those tracked, {there}; found {name}{did_you_mean(name, self.bodies)}"
+            )
+        return replace(self, track=tracks.from_body(self.track, self.bodies[name]))
 
     def image(self, number: int) -> NDArray[np.uint8]:
         """Read one B-scan : (h, w), counted from 0 whatever its frame's number; InputError if it is damaged."""

@@ -121,6 +121,22 @@ def relative(track: Track, reference: Track, at_first: Track) -> Track:
     return Track(track.times, poses, own, shared)
 
 
+def from_body(track: Track, body: Track) -> Track:
+    """A track in the frame of another body: poses `body_from_target` at the track's moments, of the noise of both.
+
+    Tolerances that both share, as those of the cameras, count twice, so that the shared part is no less than it is.
+    """
+    if not np.array_equal(track.times, body.times):
+        shares = np.nan_to_num(shares_at(body, track.times, 0.0))
+        own, alike = (
+            None if each is None else np.einsum("nm,mij->nij", weights, each[body.found])
+            for each, weights in ((body.covariance, shares**2), (body.shared, shares))
+        )
+        body = Track(track.times, at(body, track.times), own, alike)
+    still = Track(np.zeros(1, np.int64), np.eye(4)[None], np.zeros((1, 6, 6)))
+    return relative(track, body, still)
+
+
 def _inverse(pose: Array) -> Array:
     """Inverse of a pose; NaN of one that isn't known."""
     return rigid.invert(pose) if np.isfinite(pose).all() else np.full((4, 4), np.nan)

@@ -15,6 +15,7 @@ from recon.probe_calibration.movement import Movement
 from recon.probe_calibration.point_calibration import NO_POSE, Sightings
 
 PHANTOMS, CROSSED_WIRES = "recon.probe_calibration.phantoms", "crossed_wires"  # a module each; the usual one
+STYLUS = "stylus"
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width, height, px

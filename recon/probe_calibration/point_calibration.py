@@ -18,10 +18,13 @@ for the rig of the paper:
     35 degrees         0.09       0.10 to 0.12 mm
 
 With the crossing at random places of the image, or with 0.3 mm of slice thickness, the corners are 50 % worse.
+
+**A point that is known**, as a stylus' tip in the frame of its target, needs no turns: its place in the probe's frame then comes
+from the poses alone, and the pixels' places from that of the point in three images or more, in closed form.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,7 +62,7 @@ REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width an
 ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
 FLOOR_MM = 1e-3  # no sighting counts as more exact than this
 APART_MM = 1.0  # 1 sigma of the distance of wires that cross, before it is measured
-KNOWN = np.append(np.zeros(11), APART_MM**-2)  # information on UNKNOWNS beforehand
+FREE = np.full(3, np.inf)  # standard deviations of a point of which nothing is known beforehand
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ class Adjustment:
     apart_mm: float = 0.0  # between the wires' axes, where they were seen as lines
     moved: Movement | None = None  # what moved while the frames were taken; the values are those of the middle
     by_lag: Array | None = None  # (8,) change of the calibration by one standard deviation of the lag, if the lag has one
+    wire_covariance: Array | None = None  # (3, 3) mm^2, of the wire; None without an adjustment
 
     @property
     def rms_mm(self) -> float:
@@ -134,12 +138,25 @@ class _Estimate:
     scale: Array  # (2,)
     wire: Array  # (3,)
     apart: float = 0.0  # mm, of the wires
+    wire_sigma: Array = field(default_factory=lambda: FREE)  # (3,) mm, of the wire about the origin beforehand
+    level: float = 1.0  # of the noise over the assumed, beside which what is known counts
+
+    @property
+    def known(self) -> Array:
+        """Information : (12,) on UNKNOWNS beforehand."""
+        return np.concatenate([np.zeros(UNKNOWNS["wire"].start), (self.level / self.wire_sigma) ** 2, [APART_MM**-2]])
+
+    @property
+    def departures(self) -> Array:
+        """UNKNOWNS : (12,) less what they are expected to be, where that is known."""
+        return np.concatenate([np.zeros(UNKNOWNS["wire"].start), self.wire, [self.apart]])
 
     def moved(self, step: Step) -> "_Estimate":
         """After a step of UNKNOWNS."""
         scale, probe, wire, apart = UNKNOWNS.split(step.shared)
         pose = rigid.moved(self.target_from_image, probe)
-        return _Estimate(pose, self.scale + scale, self.wire + wire, self.apart + float(apart[0]))
+        moved = {"target_from_image": pose, "scale": self.scale + scale, "wire": self.wire + wire}
+        return replace(self, **moved, apart=self.apart + float(apart[0]))
 
     def pixels(self, sightings: Sightings) -> Array:
         """Pixels : (n, 2) of the midpoint between the wires."""
@@ -164,6 +181,7 @@ def calibrate(
     ahead_sigma_mm: float = 0.0,
     max_sigma_mm: float = probe_checks.MAX_SIGMA_MM,
     numbers: NDArray[np.int64] | None = None,
+    point_sigma_mm: Array | None = None,
 ) -> Adjustment:
     """Calibrate a probe from poses and pixels of one point at rest: of two wires, the midpoint between their axes.
 
@@ -189,6 +207,9 @@ def calibrate(
         Standard deviation of a pixel's place beyond which the outcome is refused.
     numbers : (n,)
         Of the frames, for messages; from 0 on without them.
+    point_sigma_mm : (3,)
+        Standard deviations of the point about the origin of the poses' frame, along its axes; None for an unknown one. With it
+        the probe needs no turns.
 
     Raises
     ------
@@ -199,8 +220,8 @@ def calibrate(
     arguments.of_kind("sightings", sightings, Sightings)
     noise = noise or Noise()
     sightings = _checked(sightings, size)
-    probe_checks.motion(sightings.poses, sightings.pixels, size)
-    start = _robust_start(sightings, noise, np.random.default_rng(seed))
+    _check_motion(sightings, size, point_sigma_mm)
+    start = _robust_start(sightings, noise, np.random.default_rng(seed), point_sigma_mm)
     estimate, inliers, factor = _without_outliers(start, sightings, noise)
     sightings = _with_wires(estimate, sightings, inliers)
     if sightings.beside is not None:
@@ -210,13 +231,13 @@ def calibrate(
         _say_why(sightings, noise, rms, factor, inliers, _farthest(estimate, sightings, numbers))
     slopes, left = _whitened(estimate, sightings, noise)
     used = UNKNOWNS["wire"].stop if sightings.beside is None else len(UNKNOWNS)
-    equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], KNOWN[:used])
+    equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
     step, covariance = movement.average(equations, solved, inliers, factor)
     estimate = estimate.moved(Step(np.pad(step, (0, len(UNKNOWNS) - used)), np.zeros((0, 0))))
-    probe_checks.motion(sightings.poses[inliers], sightings.pixels[inliers], size)
-    covariance = covariance[: len(NAMES), : len(NAMES)].copy()
+    _check_motion(sightings.of(inliers), size, point_sigma_mm)
+    of_wire, covariance = covariance[UNKNOWNS["wire"], UNKNOWNS["wire"]], covariance[: len(NAMES), : len(NAMES)].copy()
     by_lag = None if sightings.pose_by_lag is None else _by_lag(estimate, sightings, noise, inliers)
     if by_lag is not None:
         covariance += np.outer(by_lag, by_lag)
@@ -233,7 +254,7 @@ def calibrate(
     probe_checks.outcome(calibration, size, expected)
     chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
     left = _residuals(estimate, sightings)
-    return Adjustment(calibration, estimate.wire, left, chi, ~inliers, factor, abs(estimate.apart), moved, by_lag)
+    return Adjustment(calibration, estimate.wire, left, chi, ~inliers, factor, abs(estimate.apart), moved, by_lag, of_wire)
 
 
 def held_out_mm(
@@ -257,7 +278,7 @@ def held_out_mm(
     seen = seen.of(~found.outliers)
     slopes, left = _whitened(start, seen, noise)
     free = np.arange(UNKNOWNS["wire"].start, len(UNKNOWNS) if seen.beside is not None else UNKNOWNS["wire"].stop)
-    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(KNOWN)
+    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(start.known)
     step = np.zeros(len(UNKNOWNS))
     step[free] = -np.linalg.solve(information[np.ix_(free, free)], np.einsum("nij,ni->j", slopes, left)[free])
     estimate = start.moved(Step(step, np.zeros((0, 0))))
@@ -318,14 +339,31 @@ def closed_form(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
     design = np.concatenate([u / 100 * turns, v / 100 * turns, turns / 100, fixed / 100], axis=-1)  # columns of like length
     rows = (*pixels.shape[:-2], -1)
     solution = -(np.linalg.pinv(design.reshape(*rows, 12)) @ shifts.reshape(*rows, 1))[..., 0] / 100
-    columns = np.stack([solution[..., :3], solution[..., 3:6]], axis=-1)
+    pose, scale = _pose_of(np.stack([solution[..., :3], solution[..., 3:6]], axis=-1), solution[..., 6:9])
+    return pose, scale, solution[..., 9:]
+
+
+def closed_form_of_known(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """The same as `closed_form` of a point at the origin of the poses' frame, for n >= 3.
+
+    Its places in the target's frame are linear in the pixels: `u a + v b + t = -R_i^T t_i`.
+    """
+    places = -np.einsum("...ji,...j->...i", poses[..., :3, :3], poses[..., :3, 3])
+    design = np.concatenate([pixels / 100, np.ones_like(pixels[..., :1])], axis=-1)
+    solution = np.linalg.pinv(design) @ places
+    pose, scale = _pose_of(np.swapaxes(solution[..., :2, :], -1, -2) / 100, solution[..., 2, :])
+    return pose, scale, np.zeros((*places.shape[:-2], 3))
+
+
+def _pose_of(columns: Array, origin: Array) -> tuple[Array, Array]:
+    """Poses : (..., 4, 4) and scales : (..., 2) nearest to the steps : (..., 3, 2) mm of a pixel along both axes of the image."""
     scale = np.linalg.norm(columns, axis=-2)
     left, _, right = np.linalg.svd(columns / np.maximum(scale, 1e-12)[..., None, :], full_matrices=False)
     axes = left @ right
-    result = np.zeros((*pixels.shape[:-2], 4, 4))
+    result = np.zeros((*origin.shape[:-1], 4, 4))
     result[..., :3, :2], result[..., :3, 2] = axes, np.cross(axes[..., 0], axes[..., 1])
-    result[..., :3, 3], result[..., 3, 3] = solution[..., 6:9], 1
-    return result, scale, solution[..., 9:]
+    result[..., :3, 3], result[..., 3, 3] = origin, 1
+    return result, scale
 
 
 def point_covariance(calibration: ProbeCalibration, pixels: ArrayLike) -> Array:
@@ -368,6 +406,14 @@ def _checked(sightings: Sightings, size: Size) -> Sightings:
     probe_checks.poses(poses)
     probe_checks.pixels(pixels, size)
     return Sightings(**given)
+
+
+def _check_motion(sightings: Sightings, size: Size, point_sigma_mm: Array | None) -> None:
+    """Refuse a motion that leaves unknowns undetermined at any noise."""
+    if point_sigma_mm is None:
+        probe_checks.motion(sightings.poses, sightings.pixels, size)
+    else:
+        probe_checks.places(sightings.pixels, size)
 
 
 def _with_wires(estimate: _Estimate, sightings: Sightings, inliers: Mask) -> Sightings:
@@ -425,10 +471,9 @@ def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, w
     """Normal equations and cost, with the covariances as they are at the estimate; no frame has unknowns of its own."""
     slopes, residuals = _whitened(estimate, sightings, noise)
     root = np.sqrt(weights)[:, None]
-    left, departures = -root * residuals, np.zeros(len(UNKNOWNS))
-    departures[UNKNOWNS["apart"]] = estimate.apart
+    left, known, departures = -root * residuals, estimate.known, estimate.departures
     equations = NormalEquations.of_rows(root[..., None] * slopes, np.zeros((*left.shape, 0)), left)
-    return equations.held(np.diag(KNOWN), departures), float(np.sum(left**2) + (estimate.apart / APART_MM) ** 2)
+    return equations.held(np.diag(known), departures), float(np.sum(left**2) + known @ departures**2)
 
 
 def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | float = 1.0) -> _Estimate:
@@ -437,15 +482,16 @@ def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | 
     return descend(start, lambda estimate: _normal_equations(estimate, sightings, noise, weights), _Estimate.moved).estimate
 
 
-def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator) -> _Estimate:
+def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator, point_sigma_mm: Array | None = None) -> _Estimate:
     """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
     n = len(sightings.pixels)
     draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
-    whole = [each[None] for each in closed_form(sightings.poses, sightings.pixels)]
-    drawn = closed_form(sightings.poses[draws], sightings.pixels[draws])
+    solve, sigma = (closed_form, FREE) if point_sigma_mm is None else (closed_form_of_known, point_sigma_mm)
+    whole = [each[None] for each in solve(sightings.poses, sightings.pixels)]
+    drawn = solve(sightings.poses[draws], sightings.pixels[draws])
     starts = [np.concatenate(pair) for pair in zip(whole, drawn, strict=True)]
     order = np.argsort(_medians(starts, sightings))[:5]
-    best = [_refined_on_half(_Estimate(*(each[k] for each in starts)), sightings, noise) for k in order]
+    best = [_refined_on_half(_Estimate(*(each[k] for each in starts), wire_sigma=sigma), sightings, noise) for k in order]
     return min(best, key=lambda estimate: np.median(_squared(estimate, sightings, noise)))
 
 
@@ -474,7 +520,7 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         squared = _squared(estimate, sightings, noise)
         scale = max(np.median(squared) / MEDIAN, 1e-12)
         weights = np.maximum(1 - squared / (2 * GATE * scale), 0) ** 2
-        estimate = _fit(estimate, sightings, noise, weights)
+        estimate = _fit(replace(estimate, level=float(np.sqrt(scale))), sightings, noise, weights)
     inliers = np.zeros(len(sightings.pixels), bool)
     factor, gate = np.sqrt(scale), GATE
     for _ in range(20):
@@ -482,7 +528,7 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
         if inside.sum() < MIN_FRAMES or (inside == inliers).all():
             break
         inliers = inside
-        estimate = _fit(estimate, sightings.of(inliers), noise)
+        estimate = _fit(replace(estimate, level=float(factor)), sightings.of(inliers), noise)
         freedom = 3 * inliers.sum() - 11 - (sightings.beside is not None)
         factor = np.sqrt(max(_squared(estimate, sightings.of(inliers), noise).sum() / freedom, 1e-12))
         gate = 3 * stats.f.isf(stats.chi2.sf(GATE, 3), 3, freedom)  # GATE of a level that is itself measured by these frames
@@ -497,7 +543,7 @@ def _by_lag(estimate: _Estimate, sightings: Sightings, noise: Noise, used: Mask)
     shifts = np.einsum("nij,nj->ni", moved[:, :3, :3], estimate.points(there)) + moved[:, :3, 3]
     slopes = _whitened(estimate, there, noise)[0]
     left = whitening(_covariances(estimate, there, noise)) @ shifts[..., None]
-    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(KNOWN)
+    information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(estimate.known)
     return -np.linalg.solve(information, np.einsum("nij,nik->j", slopes, left))[: len(NAMES)]
 
 

@@ -99,6 +99,11 @@ def motion(world_from_target: Array, of_crossing: Array, size: Size) -> None:
         raise InputError(f"motion: expected turns of the probe about two axes, found none: at most {rms[0]:.1f} deg (rms)")
     if rms[1] < MIN_TURN_DEG:
         raise InputError(f"motion: expected turns of the probe about two axes, found {_one_axis(axes, rms)}")
+    places(of_crossing, size)
+
+
+def places(of_crossing: Array, size: Size) -> None:
+    """Refuse places in the image that leave a scale or the image's attitude undetermined, and name the missing depth or width."""
     spread = of_crossing.std(axis=0) / size
     lengths = {"depth": spread[1], "lateral position": spread[0]}
     for name, value in lengths.items():

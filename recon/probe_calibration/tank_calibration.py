@@ -15,7 +15,7 @@ from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Probe
 from recon.probe_calibration import probe_checks, sound_in_water, wires
 from recon.probe_calibration.cross_wire import Appearance
-from recon.probe_calibration.phantom_frames import CROSSED_WIRES, PHANTOMS, Adjusted, PhantomFrames
+from recon.probe_calibration.phantom_frames import CROSSED_WIRES, PHANTOMS, STYLUS, Adjusted, PhantomFrames
 from recon.probe_calibration.point_calibration import Noise
 
 Phantom = Annotated[str, PlainValidator(partial(registry.known, PHANTOMS))]
@@ -60,6 +60,14 @@ class Settings(Part):
     """mm, its standard deviation; assumed: lines of 0.14 to 0.26 mm are sold side by side"""
     wire_speed: Annotated[float, Field(ge=300, le=10000)] = 2600.0
     """m/s, of sound in the wire; nylon. Steel makes 5900"""
+    body: str | None = None
+    """of a capture: name of the tracked body that the phantom rests on, as the tip of a stylus does; null is the world"""
+    tip: Path | None = None
+    """of stylus: its tip.yaml, of `sonotwin calibrate-tip`; null finds the tip with the probe, turned about two axes"""
+    tip_radius_mm: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """mm, of stylus: by which its echo comes from before the tip: the radius of a ball, or of a shaft that is cut off square"""
+    tip_radius_sigma_mm: NotNegative = 0.05
+    """mm, its standard deviation; assumed"""
     max_sigma_mm: Annotated[float, Field(gt=0, le=100)] = probe_checks.MAX_SIGMA_MM
     """mm, greatest standard deviation, in any direction, of the place of a pixel; what is known less well is refused"""
     appearance: Appearance = Appearance()
@@ -108,6 +116,12 @@ class Settings(Part):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _of_a_stylus(self) -> "Settings":
+        if self.tip is not None and self.phantom != STYLUS:
+            raise ValueError(f"tip: expected none with phantom={self.phantom}, found {self.tip}: phantom={STYLUS}?")
+        return self
+
     @property
     def wanted_speed(self) -> float:
         """Speed of sound, m/s, that the calibration is converted to where that of the tank is known."""
@@ -134,13 +148,13 @@ class Settings(Part):
 
     @property
     def echo_ahead_mm(self) -> float:
-        """Distance of the wires' echo before their axes."""
-        return self._ahead_of(self.wire_radius_mm)
+        """Distance of the wires' echo before their axes, or of a stylus' before its tip."""
+        return self.tip_radius_mm if self.phantom == STYLUS else self._ahead_of(self.wire_radius_mm)
 
     @property
     def echo_ahead_sigma_mm(self) -> float:
-        """Its standard deviation, by that of the wires' radius."""
-        return abs(self._ahead_of(self.wire_radius_sigma_mm))
+        """Its standard deviation, by that of the radius."""
+        return self.tip_radius_sigma_mm if self.phantom == STYLUS else abs(self._ahead_of(self.wire_radius_sigma_mm))
 
     def _ahead_of(self, radius_mm: float) -> float:
         speed = self.water_speed if self.tank_known else float(sound_in_water.speed_of_sound(ORDINARY_C))

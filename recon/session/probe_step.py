@@ -68,6 +68,9 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
         for name, value in (("clip", self.clip), ("lag_s", self.lag_s or None), ("lag_sigma_s", self.lag_sigma_s or None)):
             if self.pairs is not None and value is not None:
                 raise ValueError(f"{name}: expected none with pairs, which come without images and times, found {value}")
+        if self.body is not None and self.capture is None:
+            way = "; reference=FRAME has that of a sequence" if self.sequence is not None else ""
+            raise ValueError(f"body: expected none without a capture, found {self.body}{way}")
         if self.pairs is not None and self.phantom != phantom_frames.CROSSED_WIRES:
             raise ValueError(f"phantom: expected none with pairs, which are of one point, found {self.phantom}")
         return self
@@ -100,7 +103,15 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     InputError
         If the input is incomplete or damaged, doesn't determine the calibration, or `out` can't be written to.
     """
-    sources = (settings.capture, settings.sequence, settings.pairs, settings.earlier, settings.tracker, settings.wires)
+    sources = (
+        settings.capture,
+        settings.sequence,
+        settings.pairs,
+        settings.earlier,
+        settings.tracker,
+        settings.wires,
+        settings.tip,
+    )
     atomic.check_folder(out, BY, inputs=sources)
     earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
     if settings.temperature_c is not None:
@@ -110,6 +121,8 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
         frames = phantom_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
         sweep = sequence_sweep.read_source(settings, settings.capture, settings.sweep, "probe")
+        if settings.body is not None and isinstance(sweep, SweepCapture):
+            sweep = sweep.from_body(settings.body)
         say_assumed(settings, watch)
         reference = None if settings.sequence is None else settings.frame_names(FrameNames()).reference
         frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma, reference)

@@ -77,3 +77,31 @@ def test_tracks_of_other_moments_and_missing_first_poses_are_refused(rng):
         tracks.relative(moved, track(poses(rng, 3)), track(poses(rng, 1)))
     with pytest.raises(InputError, match="at_first: expected a pose"):
         tracks.relative(moved, track(poses(rng)), track(np.full((1, 4, 4), np.nan)))
+
+
+def test_poses_from_a_body_are_exact_and_have_the_noise_of_both(rng):
+    """As relative to a body that stood at the origin of its own frame, exactly."""
+    moved, body, own, of_body = poses(rng), poses(rng), covariances(rng), covariances(rng)
+    found = tracks.from_body(track(moved, own), track(body, of_body))
+    assert np.allclose(found.poses, np.linalg.inv(body) @ moved, atol=1e-9)
+    draws = 4000
+    for k in range(COUNT):
+        steps = [rng.multivariate_normal(np.zeros(6), each[k], draws) for each in (own, of_body)]
+        bodies, references = (
+            rigid.moved(np.repeat(pose[None], draws, axis=0), step) for pose, step in zip((moved[k], body[k]), steps, strict=True)
+        )
+        off = np.array([rigid.difference(found.poses[k], one) for one in np.linalg.inv(references) @ bodies])
+        root = np.linalg.inv(np.linalg.cholesky(found.covariance[k]))
+        assert np.abs(np.linalg.eigvalsh(root @ np.cov(off.T) @ root.T) - 1).max() < 0.15  # 6 sigma of 4000 draws
+
+
+def test_a_body_of_other_moments_is_interpolated(rng):
+    """Halfway its variance is half of two poses'; beyond its track there is no pose."""
+    held = poses(rng, 1)[0]
+    course = np.array([rigid.transform(held[:3, :3], held[:3, 3] + [10.0 * k, 0, 0]) for k in range(3)])
+    times = np.array([0, 100, 200]) * 10**6
+    halfway = Track(np.array([50, 150, 250]) * 10**6, np.repeat(held[None], 3, axis=0), np.zeros((3, 6, 6)))
+    found = tracks.from_body(halfway, Track(times, course, np.tile(np.eye(6), (3, 1, 1))))
+    assert found.found.tolist() == [True, True, False]
+    assert np.allclose(found.poses[0, :3, 3], held[:3, :3].T @ [-5.0, 0, 0])
+    assert np.allclose(found.covariance[0, :3, :3], np.eye(3) / 2)
