@@ -28,6 +28,7 @@ def test_requirements_are_those_of_the_project():
     assert {part: parts.count(part) for part in expected} == expected
 
 
+@pytest.mark.slow
 def test_this_installation_is_sound(capsys):
     """The tests run in it, so its core is, and what is installed can be imported."""
     assert cli.main(["doctor"]) == 0

@@ -49,18 +49,19 @@ def test_steady_poses_scatter_as_their_noise(cameras, monkeypatch):
     assert all(1 <= one.rise < 1.05 for one in found)
 
 
-def test_a_board_that_bends_is_told_and_counts(cameras, monkeypatch):
+@pytest.mark.parametrize("sets", [1, pytest.param(6, marks=pytest.mark.slow)])
+def test_a_board_that_bends_is_told_and_counts(cameras, monkeypatch, sets):
     """Arches and twists of 0.02 mm (RMS), new in each pose: found to a factor of two, and errors as large as predicted."""
     ways = departures(BOARD.points())[0][:, -3:]
 
     def bent(k, rng):
         return cameras, BOARD.points() + (ways @ (0.02 * rng.standard_normal(3))).reshape(-1, 3)
 
-    found, squared = results(cameras, range(6), monkeypatch, bent)
+    found, squared = results(cameras, range(sets), monkeypatch, bent)
     assert all(one.scatter > 2 and "bend" in one.warning and one.rise > 1.5 for one in found)
     assert all((one.covariance == one.covariance.T).all() for one in found), "as readers demand it"
     assert 0.01 < np.median([one.bend_mm for one in found]) < 0.04
-    assert 0.4 < squared < 2  # 84 random bends in 6 sets, in directions that are far from alike
+    assert sets == 1 or 0.4 < squared < 2  # 84 random bends in 6 sets, in directions that are far from alike
 
 
 @pytest.mark.parametrize("moved", [lambda k: k >= 7, lambda k: k % 2], ids=["at half time", "every other pose"])
