@@ -30,7 +30,6 @@ from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from recon.errors import InputError
@@ -61,14 +60,17 @@ GOOD = 1e-3  # chance of a good frame's residual beyond the gate
 DIRECTIONS = 300  # of a wall's normal that are tried, on a half sphere
 CLOSER_DEG = (3.0, 1.0, 0.3)  # between those about the best ones
 REWEIGHTED, REWEIGHTED_MM = 5, 0.1  # rounds, and the distance below which all count alike
+DRAWS = 50  # random sets of a sphere's frames; at 20 % outliers 0.8**10 = 11 % of them are clean
 REFINED = 6  # starts that are refined, the best
 REFINE = Rules(steps=8)  # of these, which need not converge
 STEEPEST = 0.95  # sine of a tilt across the plane
 LEAST, LEAST_LEVEL = 1e-12, 1e-3  # measured noise over the assumed: exact numbers have none
 SURE, LIKELY = 5.0, 3.0  # standard deviations from which on an unusual value is told, of a sphere's radius beside others
+BENDS = 0.01  # of a radius, by which speckle on its slopes may bend all arcs alike
 NO_LAG_S = 0.005  # lag that isn't worth a word
 LIKELY_MM = 0.5  # from the surface, of points that are read rightly
 LAGS_S = np.array([-0.28, -0.24, -0.2, -0.16, -0.12, -0.08, -0.04, 0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28])  # tried
+MOST_TRIED, REFINED_TRIED = 40, 2  # frames and starts, of a refusal
 UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
 WEAK_DEG, WEAK_SHARE = 6.0, 0.08  # rms turns, and places as a share of the image, below which a motion is the cause
 
@@ -239,7 +241,7 @@ class _Estimate:
     target_from_image: Array  # (4, 4)
     scale: Array  # (2,) mm/px
     surface: Surface
-    mirror: float = MIRROR  # share
+    mirror: float = 0.0  # share
 
     def moved(self, step: Step) -> "_Estimate":
         """After a step of `_unknowns`; `Unreachable` where no image can be."""
@@ -414,7 +416,7 @@ def _starts_of_sphere(frames: CurveSightings, radius: tuple[float, float]) -> li
     """Starts by the arcs' tops: these are one point at rest, but for the radius along the beam and places beside the middle."""
     tops = _tops(frames.pixels)
     rng, n = np.random.default_rng(0), len(tops)
-    sets = [np.arange(n), *(rng.permutation(n)[:MIN_FRAMES] for _ in range(100))]
+    sets = [np.arange(n), *(rng.permutation(n)[:MIN_FRAMES] for _ in range(DRAWS))]
     starts = []
     for chosen in sets:
         pose, scale, centre = point_calibration.closed_form(frames.poses[chosen], tops[chosen])
@@ -431,19 +433,19 @@ def _tops(pixels: Array) -> Array:
     return np.column_stack([middle + half * away, pixels[:, 1, 1] + slope * away + bend * away**2])
 
 
-def _robust_start(frames: CurveSightings, radius: tuple[float, float] | None, noise: Noise) -> _Estimate:
+def _robust_start(frames: CurveSightings, radius: tuple[float, float] | None, noise: Noise, refined: int = REFINED) -> _Estimate:
     """Least median of squares over starts, the best few of which are refined on their better halves."""
     starts = _starts_of_wall(frames) if radius is None else _starts_of_sphere(frames, radius)
-    medians = [float(np.median(np.abs(each.surface.distances(each.places(frames))))) for each in starts]
-    refined = [_refined_on_half(starts[k], frames, noise) for k in np.argsort(medians)[:REFINED]]
-    return min(refined, key=lambda each: (each.scale.min() < SHRUNK, float(np.median(_squared(each, frames, noise)))))
+    medians = [float(np.median(np.abs(_linear(each, frames, noise).distances))) for each in starts]
+    best = [_refined_on_half(starts[k], frames, noise) for k in np.argsort(medians)[:refined]]
+    return min(best, key=lambda each: (each.scale.min() < SHRUNK, float(np.median(_squared(each, frames, noise)))))
 
 
 def _refined_on_half(start: _Estimate, frames: CurveSightings, noise: Noise) -> _Estimate:
     """After two rounds of least squares on the better half of the frames."""
     keep = max(len(frames.poses) // 2 + 1, min(MIN_FRAMES, len(frames.poses)))
     for _ in range(2):
-        away = np.abs(start.surface.distances(start.places(frames))).max(axis=1)
+        away = np.abs(_linear(start, frames, noise).distances).max(axis=1)
         start = _fit(start, frames.of(np.argsort(away)[:keep]), noise, rules=REFINE)
     return start
 
@@ -507,14 +509,18 @@ class SurfaceAdjustment:
 
     def doubts(self) -> Iterator[str]:
         """What is unusual in a way that a mistake is."""
-        if isinstance(self.surface, Sphere):
-            (radius, sigma), (given, given_sigma) = self.radius, self.surface.given
-            if abs(radius - given) > LIKELY * np.hypot(sigma, given_sigma):
-                yield f"by arcs and motion the sphere's radius is {radius:.2f} ± {sigma:.2f} mm, given {given:g}"
+        if isinstance(self.surface, Sphere) and _off(self.radius, self.surface.given, LIKELY):
+            radius, sigma = self.radius
+            yield f"by arcs and motion the sphere's radius is {radius:.2f} ± {sigma:.2f} mm, given {self.surface.given[0]:g}"
         if self.moved is not None:
             yield _described(self.moved)
         if _is_late(self.more_lag_s):
             yield _described_lag(self.more_lag_s)
+
+
+def _off(found: tuple[float, float], given: tuple[float, float], sigmas: float) -> bool:
+    """Whether a radius is another than given, by some standard deviations of both, and more than speckle bends arcs."""
+    return abs(found[0] - given[0]) > sigmas * np.hypot(found[1], given[1]) + BENDS * given[0]
 
 
 def _has_extent(estimate: _Estimate) -> bool:
@@ -581,7 +587,7 @@ def calibrate(
     start = _robust_start(sightings, radius, noise)
     estimate, inliers, level = _without_outliers(start, sightings, noise)
     used = sightings.of(inliers)
-    rms = _rms(estimate.surface.distances(estimate.places(used)))
+    rms = _rms(_linear(estimate, used, noise).distances)
     if level > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS or not _has_extent(estimate):
         _say_why(estimate, sightings, radius, noise, (level, rms, float(inliers.mean())), numbers)
     blocks = _unknowns(estimate.surface)
@@ -591,7 +597,7 @@ def calibrate(
     spread = inverse(_information(equations, inliers))
     by_arcs = _radius(estimate, spread)
     lag = _more_lag(estimate, sightings, noise, equations, inliers, spread)
-    if radius is not None and abs(by_arcs[0] - radius[0]) > SURE * np.hypot(by_arcs[1], radius[1]):
+    if radius is not None and _off(by_arcs, radius, SURE):
         _refuse_reading(sightings, radius, noise, min(LIKELY_MM, rms))
         found = f"{radius[0]:g} mm, where the arcs and the motion make it {by_arcs[0]:.2f} ± {by_arcs[1]:.2f} mm"
         raise InputError(f"sphere_radius_mm: expected the sphere's radius, found {found}: its diameter, another unit or sphere?")
@@ -689,14 +695,14 @@ def _weak(estimate: _Estimate, frames: CurveSightings, size: Size) -> dict[str, 
         weak[f"nearly one lateral position only, {100 * aside:.0f} % of the image (rms)"] = aside / WEAK_SHARE
         return weak
     normals = np.einsum("nki,nij->nkj", estimate.surface.normals(places), axes).mean(axis=1)
-    rolled = Rotation.from_matrix(np.swapaxes(axes, 1, 2)).as_matrix() @ estimate.surface.across.T
-    roll = np.degrees(np.unwrap(2 * np.arctan2(rolled[:, 0, 1], rolled[:, 0, 0])) / 2)
+    array = axes[:, :, 0] @ estimate.surface.across.T @ [1, 1j]
+    together = np.abs(np.mean(array / np.maximum(np.abs(array), LEAST)))  # 1 without any roll
     for name, value in (
-        ("tilts about the array, out of the image's plane", np.degrees(np.arcsin(np.clip(normals[:, 2], -1, 1)))),
-        ("tilts in the image's plane", np.degrees(np.arcsin(np.clip(normals[:, 0], -1, 1)))),
-        ("rolls about the depth axis", roll),
+        ("tilts about the array, out of the image's plane", np.arcsin(np.clip(normals[:, 2], -1, 1)).std()),
+        ("tilts in the image's plane", np.arcsin(np.clip(normals[:, 0], -1, 1)).std()),
+        ("rolls about the depth axis", np.sqrt(-2 * np.log(np.clip(together, LEAST, 1)))),
     ):
-        weak[f"hardly any {name}, {value.std():.1f} deg (rms)"] = float(value.std()) / WEAK_DEG
+        weak[f"hardly any {name}, {np.degrees(value):.1f} deg (rms)"] = float(np.degrees(value)) / WEAK_DEG
     return weak
 
 
@@ -722,16 +728,9 @@ def _say_why(
 ) -> None:
     """Refuse frames that don't show a surface at rest, and name the reading of the poses under which they would."""
     level, rms, agree = found
-    what = "a wall" if radius is None else f"a sphere of {radius[0]:g} mm"
+    what = _named(radius)
     away = np.sqrt((_linear(estimate, frames, noise).distances ** 2).mean(axis=1))
-    likely, least = "", min(float(np.median(away)) / 4, MAX_RMS_MM) if _has_extent(estimate) else LIKELY_MM
-    for meaning, other in _readings(frames):
-        start = _robust_start(other, radius, noise)
-        misfit = float(np.median(np.abs(start.surface.distances(start.places(other)))))
-        if misfit < least and _has_extent(start):
-            likely, least = meaning, misfit
-    if likely:
-        raise InputError(f"sightings: expected frames of {what} at rest, found {likely}: read so, they are")
+    _refuse_reading(frames, radius, noise, min(float(np.median(away)) / 4, MAX_RMS_MM) if _has_extent(estimate) else LIKELY_MM)
     names = np.arange(len(away)) if numbers is None else numbers
     farthest = ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
     if not _has_extent(estimate):
@@ -749,10 +748,11 @@ def _named(radius: tuple[float, float] | None) -> str:
 
 def _refuse_reading(frames: CurveSightings, radius: tuple[float, float] | None, noise: Noise, most_mm: float) -> None:
     """Refuse a common mistake without which most points would lie within a distance from the surface."""
+    some = np.unique(np.linspace(0, len(frames.poses) - 1, MOST_TRIED).astype(int))
     likely, least = "", most_mm
-    for meaning, other in _readings(frames):
-        start = _robust_start(other, radius, noise)
-        misfit = float(np.median(np.abs(start.surface.distances(start.places(other)))))
+    for meaning, other in _readings(frames.of(some)):
+        start = _robust_start(other, radius, noise, refined=REFINED_TRIED)
+        misfit = float(np.median(np.abs(_linear(start, other, noise).distances)))
         if misfit < least and _has_extent(start):
             likely, least = meaning, misfit
     if likely:

@@ -161,7 +161,7 @@ def late(seen, lag_s=0.2):
 @pytest.mark.parametrize(("wrong", "said"), [
     (mirrored, "as if the image is mirrored left to right"),
     (in_metres, "found poses in m: read so, they are"),
-    (late, "found B-scans late by about 0.20 s beyond lag_s"),
+    pytest.param(late, "found B-scans late by about 0.20 s beyond lag_s", marks=pytest.mark.slow),
 ])  # fmt: skip
 @pytest.mark.parametrize(("surface", "radius"), KINDS, ids=NAMES)
 def test_mistakes_are_named(surface, radius, wrong, said, rig, rng):
@@ -171,6 +171,7 @@ def test_mistakes_are_named(surface, radius, wrong, said, rig, rng):
         surface_calibration.calibrate(seen, SIZE, radius, expected=probe.target_from_image)
 
 
+@pytest.mark.slow
 def test_inverse_poses_are_named_of_a_wall_and_refused_of_a_sphere(rig, rng):
     probe = true_probe(rig)
     with pytest.raises(InputError, match="found poses of target_from_world, the inverse"):
@@ -188,7 +189,7 @@ def test_a_wall_upside_down_is_named_and_a_sphere_refused(rig, rng):
         surface_calibration.calibrate(upside_down(exact(probe, BALL, rng)), SIZE, RADIUS, expected=probe.target_from_image)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.9, 1.1, 2.0])
+@pytest.mark.parametrize("factor", [*(pytest.param(factor, marks=pytest.mark.slow) for factor in (0.5, 1.1, 2.0)), 0.9])
 def test_a_wrong_radius_is_refused(factor, rig, rng):
     seen = surface_sights.observe(true_probe(rig), BALL, rng)
     with pytest.raises(
