@@ -50,6 +50,7 @@ TISSUES = {
     "bright": Tissue(1.61, 1540.0, 0.5, 6.0, 0.005),  # inclusions of a grey-scale test object
     "dark": Tissue(1.59, 1540.0, 0.5, -6.0, 0.005),
     "polymer": Tissue(3.2, 2700.0, 1.4, None, 0.001),  # acrylic glass, nylon and their like [K]
+    "sanded": Tissue(3.2, 2700.0, 1.4, None, 0.03),  # the same, sanded or under matt paint: it scatters to all sides; assumed
     "steel": Tissue(46.0, 5900.0, 0.2, None, 0.002),  # [K]
     "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]

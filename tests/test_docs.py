@@ -60,7 +60,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/poses/scan",
         "result/probe/probe.yaml",
     },
-    "freehand.md": {f"{folder}/capture" for folder in ("wires", "bottom", "sweep", "tank")}
+    "freehand.md": {f"{folder}/capture" for folder in ("wires", "wall", "ball", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "fcal.xml", "probe/probe.yaml", "surface/surface.ply"}
     | {"session", "tip/tip.yaml"}
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires", "rows", "stylus")},

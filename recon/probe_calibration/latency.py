@@ -14,7 +14,6 @@ Move the probe by 10 mm or more, three times or more, at an uneven pace: a perio
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -26,6 +25,7 @@ from recon.files.metrics import Metrics
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import tracks
 from recon.model.tracks import Track
+from recon.probe_calibration import echo_curve
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,6 @@ GIVES_MM = 0.2  # standard deviation of a bracket's giving over the sweep: one s
 COVERAGE = 0.95  # of the interval
 FAR_MM = 1.0  # of a trend, that no bracket gives
 BLOCK_PX = 8  # columns taken together
-BOTTOM_SIGMA_PX = 1.5  # smoothing in depth
 BOTTOM_CONTRAST = 30.0  # grey levels above the median of its columns
 BOTTOM_NEAR_PX = 3.0  # of the line
 BOTTOM_SHARE = 0.5  # of the columns, at least, on the line
@@ -132,9 +131,8 @@ def bottom_line(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | None
     columns are left out in which it begins lower than in the middle, aside of the face.
     """
     level = np.asarray(image, np.float32)
-    blocks = level.shape[1] // BLOCK_PX
-    profiles = level[:, : blocks * BLOCK_PX].reshape(level.shape[0], blocks, BLOCK_PX).mean(axis=2)
-    profiles = cv2.GaussianBlur(profiles, (1, 0), sigmaX=1e-6, sigmaY=BOTTOM_SIGMA_PX) if blocks else profiles
+    profiles = echo_curve.block_profiles(level, BLOCK_PX)
+    blocks = profiles.shape[1]
     used = np.ones(level.shape, bool) if part is None else part
     seen = used[:, : blocks * BLOCK_PX].reshape(profiles.shape[0], blocks, BLOCK_PX).all(axis=2)
     begins = seen.argmax(axis=0)
@@ -149,7 +147,7 @@ def bottom_line(image: NDArray, top_px: int = 40, part: NDArray[np.bool_] | None
     before, peak, after = profiles[rows - 1, columns], profiles[rows, columns], profiles[rows + 1, columns]
     bend = np.minimum(before - 2 * peak + after, -1e-3)
     v = rows + np.clip((before - after) / (2 * bend), -0.5, 0.5)
-    u = (columns + 0.5) * BLOCK_PX - 0.5 - (level.shape[1] - 1) / 2
+    u = echo_curve.block_columns(blocks, BLOCK_PX)[columns] - (level.shape[1] - 1) / 2
     usual = np.nanmedian(np.where(seen, profiles, np.nan)[:, columns], axis=0)
     clear = (peak - usual > BOTTOM_CONTRAST) & (rows > face[columns])
     if clear.sum() < BOTTOM_SHARE * len(columns):

@@ -51,8 +51,8 @@ NO_NOISE = 1e-12  # sum of squares of residuals that are none
 class FrameEquations(NamedTuple):
     """Whitened equations of the adjustment, at its solution, of n frames in the order in which they were taken."""
 
-    slopes: Array  # (n, 3, g) of the residuals by the parameters
-    residuals: Array  # (n, 3)
+    slopes: Array  # (n, m, g) of the residuals by the parameters, m residuals a frame
+    residuals: Array  # (n, m)
     by_probe: slice  # parameters of the probe's turn and shift against its target
     by_wires: slice  # and of the wires' place
     known: Array  # (g,) information about each parameter from elsewhere, as the inverse of a variance
@@ -63,8 +63,8 @@ class Course(NamedTuple):
 
     growth: Array  # (n,) from -1 to 1
     frames: Mask  # (n,), of which k
-    spanned: Array  # (3 k, r) orthonormal columns: residuals that parameters may explain
-    left: Array  # (3 k,) residuals that they don't
+    spanned: Array  # (m k, r) orthonormal columns: residuals that parameters may explain
+    left: Array  # (m k,) residuals that they don't
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def _courses(equations: FrameEquations, used: Mask) -> Iterator[Course]:
 
 
 def _still(equations: FrameEquations, frames: Mask) -> tuple[Array, Array]:
-    """Orthonormal columns : (3 n, r) that span the slopes of n frames, and the residuals : (3 n,) that no parameters explain."""
+    """Orthonormal columns : (m n, r) that span the slopes of n frames, and the residuals : (m n,) that no parameters explain."""
     left = equations.residuals[frames].ravel()
     columns, sizes, _ = np.linalg.svd(equations.slopes[frames].reshape(len(left), -1), full_matrices=False)
     spanned = columns[:, sizes > np.finfo(float).eps * max(columns.shape) * sizes[0]]
@@ -182,9 +182,9 @@ def _fit(equations: FrameEquations, what: str, course: Course, used: Mask, trial
 
 
 def _explained(left: Array, doubtful: Mask, frames: Mask) -> bool:
-    """Whether residuals : (3 n,) of frames that were outliers before are as small as the others'."""
-    lengths = np.linalg.norm(left.reshape(-1, 3), axis=1)
+    """Whether residuals : (m n,) of frames that were outliers before are as small as the others'."""
     before = doubtful[frames]
+    lengths = np.linalg.norm(left.reshape(len(before), -1), axis=1)
     return not before.any() or bool(np.mean(lengths[before] < USUAL * np.median(lengths[~before])) > 1 - LOST / 2)
 
 
@@ -234,7 +234,13 @@ def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 
     probe[equations.by_probe], wires[equations.by_wires] = PROPORTIONS, np.eye(3)
     still = _outcomes(rigid, rigid.slopes @ probe, probe, np.zeros(1), STILL)
     moving = [
-        _outcomes(rigid, np.repeat(course, 3)[:, None] * (rigid.slopes @ by), at_ends, SIZES / noise, chance * share)
+        _outcomes(
+            rigid,
+            np.repeat(course, equations.residuals.shape[1])[:, None] * (rigid.slopes @ by),
+            at_ends,
+            SIZES / noise,
+            chance * share,
+        )
         for course, share in _likely_courses(frames)
         for by, at_ends, chance in ((probe, probe, GIVES), (wires, 0 * wires, SLIP))
     ]

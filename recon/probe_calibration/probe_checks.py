@@ -1,6 +1,6 @@
 """Sanity checks of a probe's calibration: its poses, pixels, motion and outcome; each fault is named."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import permutations, product
 from typing import Protocol
 
@@ -125,7 +125,13 @@ def turns(world_from_target: Array) -> tuple[Array, Array]:
 
 
 def certainty(
-    target_from_image: Array, scale: Array, covariance: Array, frames: _Frames, size: Size, most_mm: float = MAX_SIGMA_MM
+    target_from_image: Array,
+    scale: Array,
+    covariance: Array,
+    frames: _Frames,
+    size: Size,
+    most_mm: float = MAX_SIGMA_MM,
+    motions: Mapping[str, float] | None = None,
 ) -> None:
     """Refuse a motion that leaves some pixel's place uncertain by more than some mm, and name its weakest part.
 
@@ -135,6 +141,8 @@ def certainty(
         Of sx, sy, turn and shift.
     most_mm : float
         Standard deviation in any direction.
+    motions : description -> size
+        Parts of the motion that may be missing, each over the size that would do; None takes those that a point needs.
     """
     right, bottom = size[0] - 1, size[1] - 1
     slopes = place_slopes(target_from_image, scale, [(0, 0), (right, 0), (0, bottom), (right, bottom)])
@@ -143,17 +151,22 @@ def certainty(
     worst, open_ = float(lengths[corner, 0]), left[corner, :, 0]
     if worst <= most_mm:
         return
-    axes, rms = turns(frames.poses)
-    spread = frames.pixels.std(axis=0) / size
-    weak = {
-        f"turns about one axis only, {_axis(axes[0])}, others {rms[1]:.1f} deg (rms)": rms[1] / 10,
-        f"nearly one depth only, {100 * spread[1]:.0f} % of the image (rms)": spread[1] / 0.1,
-        f"nearly one lateral position only, {100 * spread[0]:.0f} % of the image (rms)": spread[0] / 0.1,
-    }
+    weak = motions or _motions(frames, size)
     named = min(weak, key=lambda name: weak[name])
     found = f"{worst:.2g} mm along {_axis(open_)}: {named}" if weak[named] < 1 else f"{worst:.2g} mm: too few or too noisy frames"
     expected = f"pixels to be placed to {most_mm:g} mm (1 sigma)"
     raise InputError(f"motion: expected {expected}, found {found}; allow more by max_sigma_mm=")
+
+
+def _motions(frames: _Frames, size: Size) -> dict[str, float]:
+    """Parts of the motion that a point needs, each over the size that would do."""
+    axes, rms = turns(frames.poses)
+    spread = frames.pixels.std(axis=0) / size
+    return {
+        f"turns about one axis only, {_axis(axes[0])}, others {rms[1]:.1f} deg (rms)": rms[1] / 10,
+        f"nearly one depth only, {100 * spread[1]:.0f} % of the image (rms)": spread[1] / 0.1,
+        f"nearly one lateral position only, {100 * spread[0]:.0f} % of the image (rms)": spread[0] / 0.1,
+    }
 
 
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:

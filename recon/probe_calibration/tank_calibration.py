@@ -68,6 +68,10 @@ class Settings(Part):
     """mm, of stylus: by which its echo comes from before the tip: the radius of a ball, or of a shaft that is cut off square"""
     tip_radius_sigma_mm: NotNegative = 0.05
     """mm, its standard deviation; assumed"""
+    sphere_radius_mm: Annotated[float, Field(gt=0, le=500)] | None = None
+    """mm, of sphere, which needs it"""
+    sphere_radius_sigma_mm: Annotated[float, Field(gt=0, le=10)] = 0.05
+    """mm, its standard deviation, which goes into the depth; assumed, of callipers"""
     max_sigma_mm: Annotated[float, Field(gt=0, le=100)] = probe_checks.MAX_SIGMA_MM
     """mm, greatest standard deviation, in any direction, of the place of a pixel; what is known less well is refused"""
     appearance: Appearance = Appearance()
@@ -120,6 +124,13 @@ class Settings(Part):
     def _of_a_stylus(self) -> "Settings":
         if self.tip is not None and self.phantom != STYLUS:
             raise ValueError(f"tip: expected none with phantom={self.phantom}, found {self.tip}: phantom={STYLUS}?")
+        return self
+
+    @model_validator(mode="after")
+    def _of_a_sphere(self) -> "Settings":
+        if self.sphere_radius_mm is not None and self.phantom != "sphere":
+            expected = f"sphere_radius_mm: expected none with phantom={self.phantom}"
+            raise ValueError(f"{expected}, found {self.sphere_radius_mm:g}: phantom=sphere?")
         return self
 
     @property

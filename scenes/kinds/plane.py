@@ -9,6 +9,7 @@ from recon.model.rig import Finite, Fraction, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {"": "water", "plate": "sanded"}  # for ultrasound, a wall in a tank; see `scenes.acoustics`
 THICKNESS_MM = 5.0
 
 

@@ -12,6 +12,8 @@ from scenes import solid_meshes
 from scenes.kinds import plane
 from scenes.scene_types import Material, Scene, Thing
 
+MADE_OF = {"": "water", "sphere": "sanded", "background": "polymer"}  # for ultrasound, in a tank; see `scenes.acoustics`
+
 
 class Config(Part):
     """A sphere by its place, size and paint."""

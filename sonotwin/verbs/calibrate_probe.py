@@ -1,10 +1,10 @@
 """Calibrate the ultrasound probe: where the pixels of its B-scans lie in the frame of the target that it carries.
 
 Reads the sweep part of a capture folder, or a tracked sequence of the PLUS toolkit: B-scans of the crossing of two wires at
-rest in water, seen from many sides, or of N-wires, or of a tracked stylus' tip; or pairs of a pose and the crossing's pixel,
-found elsewhere. Writes into the folder `out`: probe.yaml (with its covariance); the same in the rig authors' layout,
-US_params.npz; frames.csv, the outcome of each frame; and metrics.json. A calibration that is there already is replaced. Takes a
-second for thirty B-scans.
+rest in water, seen from many sides, of N-wires, of a flat wall or a sphere, or of a tracked stylus' tip; or pairs of a pose and
+the crossing's pixel, found elsewhere. Writes into the folder `out`: probe.yaml (with its covariance); the same in the rig
+authors' layout, US_params.npz; frames.csv, the outcome of each frame; and metrics.json. A calibration that is there already is
+replaced. Takes a second for thirty B-scans.
 
 Give several runs, in one capture or many, for their repeatability: CR1 and CR2 of Meza et al. 2021 beside those that the
 covariances predict, whether the runs scatter more than that (chi-square), and each run's crossing by the others' calibration
@@ -13,13 +13,17 @@ covariances predict, whether the runs scatter more than that (chi-square), and e
 Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees, mostly forward and backward, roll it as far as the
 target is seen, and bring the crossing near all corners of the image in turn. N-wires stay in view whole: by PLUS's
 configuration with the phantom's registration little motion will do, without it turn the probe about two axes. A stylus is
-tracked as a further body, and its tip led to all corners of the image; where tip.yaml has that, nothing needs to be turned.
+tracked as a further body, and its tip led to all corners of the image; where tip.yaml has that, nothing needs to be turned. Over
+a rough wall take 100 poses: tilt the probe to 40 degrees forward and backward, rock it to 25, roll it and change the distance.
+About a sphere do the same, with its top beside the image's plane as often as in it.
 
     sonotwin calibrate-probe capture=outputs/wires/capture out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture earlier=outputs/probe/probe.yaml out=outputs/probe_again
     sonotwin calibrate-probe sequence=wires.igs.mha reference=Tracker clip=[120,80,400,500] out=outputs/probe
     sonotwin calibrate-probe phantom=n_wires wires=fcal.xml sequence=rows.igs.mha temperature_c=22 out=outputs/probe
+    sonotwin calibrate-probe phantom=wall capture=outputs/wall/capture temperature_c=22 out=outputs/probe
+    sonotwin calibrate-probe phantom=sphere sphere_radius_mm=19.8 capture=outputs/ball/capture temperature_c=22 out=outputs/probe
     sonotwin calibrate-probe phantom=stylus body=needle tip=outputs/tip/tip.yaml capture=outputs/stylus/track out=outputs/probe
     sonotwin calibrate-probe phantom=stylus sequence=stylus.igs.mha reference=Stylus tip=outputs/tip/tip.yaml out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe

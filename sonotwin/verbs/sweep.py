@@ -2,7 +2,7 @@
 
 Reads the rig, the scene, the transducer and the probe's path from conf/. Writes OUT/capture/, which calibrate-probe, measure-lag
 and freehand read like any hardware's: B-scans and tracked poses by their own clocks, and the probe's calibration, except with
-path=wire and path=rows, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times,
+path=wire, rows and tilts, from which it is to be found. Writes OUT/truth/, which only evaluation opens: true poses and times,
 and labels of what each pixel shows. Takes about a tenth of a second a B-scan on two cores, a quarter of a minute for the
 default stroke, and a minute more when it first compiles. With `add=true` other parts of a capture in OUT stay; without it
 they are refused. A capture holds several sweeps if each has a `name`.
@@ -16,6 +16,8 @@ are then in these frames, for `sonotwin track`, and nowhere else. Takes about a 
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
+    sonotwin sweep scene=plane ultrasound=water path=tilts out=outputs/wall
+    sonotwin sweep scene=sphere ultrasound=water path=tilts out=outputs/ball
 """
 
 from collections.abc import Iterable, Iterator
@@ -32,7 +34,7 @@ from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
 from twin.ultrasound.bscan import Scan
-from twin.ultrasound.probe_path import RowPath, SurfacePath, WirePath
+from twin.ultrasound.probe_path import SurfacePath
 from twin.ultrasound.sweep_session import AnyPath
 
 if TYPE_CHECKING:
@@ -66,7 +68,8 @@ def run(config: Config) -> None:
         film = filming(planned, console) if config.filmed else None
     count, moments = len(planned.plan.times), len(planned.plan.track.times)
     console.print(f"path        {led_along(config.path)}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
-    probe = None if isinstance(config.path, WirePath | RowPath) else sweep_session.calibration_of(config.rig, config.ultrasound)
+    unknown = sweep_session.PURPOSES[config.path.kind] == "probe"
+    probe = None if unknown else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
     sweep_session.write_session(
         session,

@@ -355,7 +355,7 @@ def test_another_phantom_is_one_module(capture, rig, tmp_path, monkeypatch, caps
     """Its finder is found by the name in `phantom`, and its point calibrates the probe."""
     fields = [f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}", "phantom=bead"]
     assert main(["calibrate-probe", *fields]) == 2
-    assert "phantom: expected 'crossed_wires' or 'n_wires', found 'bead'" in capsys.readouterr().err
+    assert "phantom: expected 'crossed_wires', 'n_wires', " in capsys.readouterr().err
     added.add(monkeypatch, tmp_path / "ours", phantom_frames.PHANTOMS, "bead", BEAD)
     calibrate(*fields)
     found, true = probe_files.read(tmp_path / "out" / "probe.yaml"), sweep_sets.probe_in_water(rig)

@@ -123,7 +123,7 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["scene=plane"], "scene: plane: expected one with acoustics (breast,"),
+        (["scene=ball_bar"], "scene: ball_bar: expected one with acoustics (breast,"),
         (["scene=tank", "path.surface=breast"], "path.surface: expected one of tank, found breast"),
         (["scene=tank"], "path.surface: expected a scene with a solid to stroke over, found none"),
         (["scene=tank", "path.surface=tank", "path.start_mm=[4,90]"], "path: expected the probe over tank, found it beside at"),

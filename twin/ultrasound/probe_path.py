@@ -1,5 +1,5 @@
 """Paths of a hand-led probe: along a surface in contact with it, tilted, trembling; at rest on one; up and down over a tank's
-bottom; or from rest to rest about wires.
+bottom; or from rest to rest about wires, or over a wall or a sphere.
 """
 
 from typing import Annotated, Literal
@@ -99,6 +99,20 @@ class RowPath(Part):
     roll_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # about the depth axis, both ways
     rock_deg: Annotated[float, Field(ge=0, le=60)] = 8.0  # in the image's plane
     along_mm: NotNegative = 10.0  # both ways along the wires, from their middle
+    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+
+
+class TiltPath(Part):
+    """At rest in poses over a wall or a sphere, as the probe is calibrated by them: tilted to all sides, at various distances."""
+
+    kind: Literal["tilts"] = "tilts"
+    count: Annotated[int, Field(ge=1, le=1000)] = 100  # poses, one image each
+    tilt_deg: Annotated[float, Field(ge=0, le=60)] = 40.0  # about the array, to both sides
+    rock_deg: Annotated[float, Field(ge=0, le=60)] = 25.0  # in the image's plane
+    roll_deg: Annotated[float, Field(ge=0, le=180)] = 90.0  # about the depth axis, both ways
+    depth_mm: tuple[Positive, Positive] = (13.0, 38.0)  # of the surface before the array's middle, least and most
+    aside_mm: NotNegative = 8.0  # of a sphere's middle along the array, or along a wall, both ways
+    miss_mm: NotNegative = 8.0  # likewise across the image plane, or the other way along a wall
     rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
 
 
@@ -241,6 +255,49 @@ def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) 
     places = ends.mean(axis=(0, 1)) + shift[:, None] * along
     poses = np.stack([rigid.transform(turn, place - turn @ middle) for turn, place in zip(rotations, places, strict=True)])
     return _rests(poses, path.rest_s)
+
+
+def over_surface(path: TiltPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
+    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+
+    A wall lies a depth before the array's middle, near the middle of its upper face; a sphere likewise, but for places aside.
+
+    Raises
+    ------
+    InputError
+        If the scene has neither a sphere nor a flat wall.
+    """
+    middle, radius = _surface(body)
+    rng = np.random.default_rng(seed)
+    tilt, rock, roll, aside, miss = rng.uniform(-1, 1, (5, path.count)) * [
+        [path.tilt_deg], [path.rock_deg], [path.roll_deg], [path.aside_mm], [path.miss_mm]
+    ]  # fmt: skip
+    depth = rng.uniform(*sorted(path.depth_mm), path.count)
+    rotations = _upright(0.0) @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
+    beside, none = np.column_stack([aside, 0 * aside, miss]), np.zeros(path.count)
+    places = np.append(transducer.face_mm, 0.0) + np.column_stack([none, depth + radius, none])
+    aims = np.tile(middle, (path.count, 1))
+    if radius:
+        places += beside
+    else:
+        aims += beside[:, [0, 2, 1]]
+    turned = np.einsum("nij,nj->ni", rotations, places)
+    poses = np.stack([rigid.transform(turn, place) for turn, place in zip(rotations, aims - turned, strict=True)])
+    return _rests(poses, path.rest_s)
+
+
+def _surface(body: Body) -> tuple[Array, float]:
+    """A sphere's centre : (3,) mm and its radius, or the middle of a wall's upper face and 0."""
+    named = {solid.name: solid for solid in body.solids}
+    if "sphere" in named:
+        ball = named["sphere"].mesh
+        return ball.bounds.mean(axis=0), float(ball.extents[2]) / 2
+    wall = next((named[name] for name in ("plate", "tank") if name in named), None)
+    if wall is None or body.wires:
+        found = ", ".join([*named, *(wire.name for wire in body.wires)]) or "nothing"
+        raise InputError(f"path: expected a scene of a wall or a sphere, such as scene=plane or scene=sphere, found {found}")
+    middle = wall.mesh.bounds[:, :2].mean(axis=0)
+    return np.append(middle, top(wall, middle[None])), 0.0
 
 
 def held(body: Body, transducer: Transducer, turns: Array, pixels: Array, beside: Array) -> Array:

@@ -28,17 +28,19 @@ from twin.ultrasound.probe_path import (
     Hold,
     RowPath,
     SurfacePath,
+    TiltPath,
     WirePath,
     about_crossing,
     along_surface,
     bobbing,
     over_rows,
+    over_surface,
     resting,
 )
 from twin.ultrasound.timed_sweep import STILL, Clocks, Plan, PoseNoise, moments, plan
 from twin.ultrasound.transducer import Transducer
 
-AnyPath = Annotated[SurfacePath | Hold | Bob | WirePath | RowPath, Field(discriminator="kind")]
+AnyPath = Annotated[SurfacePath | Hold | Bob | WirePath | RowPath | TiltPath, Field(discriminator="kind")]
 
 POSES = "sweep.npz"  # in the sweep's own folder of truth
 LABELS = "labels"
@@ -46,6 +48,7 @@ SCANS = "scans"  # of further bodies at the moments of the images; at the camera
 PURPOSES: dict[str, Purpose] = {
     "wire": "probe",
     "rows": "probe",
+    "tilts": "probe",
     "bob": "latency",
     "stroke": "volume",
     "hold": "volume",
@@ -93,6 +96,9 @@ def plan_sweep(
             _refuse_inside(course, body, transducer)
         case RowPath():
             course, taken = over_rows(path, body, transducer, path_seed)
+            _refuse_inside(course, body, transducer)
+        case TiltPath():
+            course, taken = over_surface(path, body, transducer, path_seed)
             _refuse_inside(course, body, transducer)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 

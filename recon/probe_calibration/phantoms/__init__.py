@@ -11,5 +11,6 @@ A module has
 - `calibrate(frames, settings, expected)`: a `phantom_frames.Adjusted`, by `phantom_frames.PhantomFrames`;
 - `figures(found)` and `describe(found, settings)` of that one: `Metrics`, and lines, besides those of all phantoms.
 
-A phantom that shows one point has but `find` of its own, the rest is in `recon.probe_calibration.point_phantom`.
+A phantom that shows one point has but `find` of its own, the rest is in `recon.probe_calibration.point_phantom`;
+of one that shows a surface, in `surface_phantom`.
 """

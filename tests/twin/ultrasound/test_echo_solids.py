@@ -130,7 +130,7 @@ def test_distances_and_labels_are_those_of_plain_interpolation(breast, rng):
 
 def test_a_scene_without_acoustics_is_refused():
     with pytest.raises(InputError, match="expected one with acoustics"):
-        body(build_scene({"kind": "sphere"}))
+        body(build_scene({"kind": "ball_bar"}))
 
 
 def test_speeds_of_tissue_and_water_are_drawn_and_steel_keeps_its_own():

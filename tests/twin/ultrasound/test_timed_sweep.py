@@ -10,7 +10,18 @@ from recon.probe_calibration import latency
 from scenes.catalogue import build_scene
 from twin.conditions import Motion, given, trembling
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.probe_path import Bob, Hand, RowPath, SurfacePath, along_surface, bobbing, over_rows, top
+from twin.ultrasound.probe_path import (
+    Bob,
+    Hand,
+    RowPath,
+    SurfacePath,
+    TiltPath,
+    along_surface,
+    bobbing,
+    over_rows,
+    over_surface,
+    top,
+)
 from twin.ultrasound.timed_sweep import Clocks, PoseNoise, moments, plan, sweep
 
 STILL = Hand(shift_mm=0.0, turn_deg=0.0)
@@ -117,3 +128,27 @@ def test_all_n_wires_stay_in_view(cylinders, clean):
     assert np.mean(inside) > 0.9
     with pytest.raises(InputError, match="expected a scene of N-wires, such as scene=n_wires, found no wires"):
         over_rows(RowPath(), cylinders, clean)
+
+
+@pytest.mark.parametrize("scene", [{"kind": "plane", "tilt_deg": [3.0, -4.0]}, {"kind": "tank"}, {"kind": "sphere"}])
+def test_the_surface_lies_at_depths_of_the_path_before_the_tilted_array(scene, clean):
+    """By marching down the line in the array's middle, and beside a sphere's top by as much as its arc is lower."""
+    scanned, path = body(build_scene(scene)), TiltPath(count=30)
+    course, taken = over_surface(path, scanned, clean)
+    poses = tracks.poses_at(course, taken, 0.0)
+    assert len(poses) == 30
+    depth = np.arange(0, 60, 0.05)
+    middle = np.array([clean.face_mm[0], 0, 0]) + depth[:, None] * [0, 1, 0]
+    lines = [rigid.apply(pose, middle) for pose in poses]
+    met = np.array([depth[(np.min([solid.distances(line) for solid in scanned.solids], axis=0) < 0).argmax()] for line in lines])
+    lower = 4.0 if scene["kind"] == "sphere" else 1.0  # mm, of an arc 11 mm aside, or of a wall that isn't level
+    assert (met > path.depth_mm[0] - 1).all() and (met < path.depth_mm[1] + lower).all()
+    straight = np.degrees(np.arccos(poses[:, 2, 1]))
+    assert 30 < straight.max() < 50 and np.ptp(met) > 15
+
+
+def test_a_scene_without_a_surface_to_tilt_over_is_refused(cylinders, clean):
+    with pytest.raises(InputError, match="expected a scene of a wall or a sphere, such as scene=plane or scene=sphere, found"):
+        over_surface(TiltPath(), cylinders, clean)
+    with pytest.raises(InputError, match=r"found tank, wire0, wire1"):
+        over_surface(TiltPath(), body(build_scene({"kind": "crosswire"})), clean)
