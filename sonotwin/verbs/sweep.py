@@ -10,6 +10,9 @@ they are refused. A capture holds several sweeps if each has a `name`.
 With `filmed=true` both cameras film the sweep, too: the rig's board, bracket and probe in a hand, over the very scene. The poses
 are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more.
 
+With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
+B-scans that they are led to.
+
     sonotwin sweep out=outputs/sweep
     sonotwin sweep conditions=lifelike out=outputs/sweep
     sonotwin sweep filmed=true clocks.camera_hz=20 out=outputs/filmed
@@ -18,6 +21,7 @@ are then in these frames, for `sonotwin track`, and nowhere else. Takes about a 
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
     sonotwin sweep scene=plane ultrasound=water path=tilts out=outputs/wall
     sonotwin sweep scene=sphere ultrasound=water path=tilts out=outputs/ball
+    sonotwin sweep rig=three_bodies path=hold 'bodies.needle={path: {kind: insertion, angle_deg: 50}}' out=outputs/needle
 """
 
 from collections.abc import Iterable, Iterator

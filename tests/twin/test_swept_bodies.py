@@ -63,7 +63,21 @@ def test_a_capture_has_their_poses_and_the_truth_has_both_clocks(tmp_path):
         off = found.bodies["needle"].poses[:, :3, 3] - truth["world_from_target"][:, :3, 3]
         assert 0.01 < off.std() < 0.05
         assert scans["world_from_target"].shape == (len(found.times), 4, 4)
+        assert scans["tip_px"].shape == (len(found.times), 2) and scans["axis_mm"].shape == (len(found.times), 2, 3)
         np.testing.assert_allclose(found.times - scans["times_ns"], 50_000_000, atol=20_000_000)
+
+
+def test_the_needle_is_seen_in_the_b_scans_at_its_tip(tmp_path):
+    """Within 5 px of the true tip, at the rest, all is brighter than without it."""
+    fields = ["rig=three_bodies", "scene=test_object", "path=hold", "path.seconds=1", "clocks.scanner_hz=3"]
+    needle = "{look: {kind: needle, etched_mm: 3}, path: {kind: insertion, seconds: 1, rest_s: 0.9, travel_mm: 5, depth_mm: 12}}"
+    for name, body in (("with", needle), ("without", "{path: {kind: insertion, beside_mm: 40}}")):
+        assert main(["sweep", f"out={tmp_path / name}", f"bodies.needle={body}", *fields]) == 0
+    shown, plain = (list(read_sweep(tmp_path / name / "capture").images()) for name in ("with", "without"))
+    with np.load(tmp_path / "with" / "truth" / "sweep" / "scans" / "needle.npz") as truth:
+        for image, other, (u, v), (_, _, beside) in zip(shown, plain, truth["tip_px"], truth["tip_mm"], strict=True):
+            near = np.s_[round(v) - 5 : round(v) + 6, round(u) - 5 : round(u) + 6]
+            assert abs(beside) < 0.8 and image[near].max() > other[near].max() + 15
 
 
 def test_the_mean_of_poses_is_the_one_they_scatter_about(rng):

@@ -16,7 +16,7 @@ RIG = rig_of_three()
 EYES = np.array([[-90.0, 0, 650], [90.0, 0, 650]])
 
 
-@pytest.mark.parametrize("kind", ["board", "needle"])
+@pytest.mark.parametrize("kind", ["board", "needle", "stylus"])
 def test_all_but_the_print_is_closed_and_behind_it(kind):
     """The print is the first part, exactly in z = 0; of the rest nothing stands before a circle."""
     target = RIG.bodies["needle"]
@@ -59,12 +59,40 @@ def test_the_board_stands_on_what_is_below():
     assert (heights @ up).min() == pytest.approx(-140, abs=0.5)
 
 
+@pytest.mark.parametrize("fields", [{"kind": "needle", "gauge": 18}, {"kind": "stylus"}, {"kind": "stylus", "ball_mm": 0}])
+def test_sound_meets_the_shaft_that_is_seen(fields):
+    """As thick, with the same tip and direction; a needle's point lies on its wall, where its bevel is closed."""
+    target, look = RIG.bodies["needle"], Look.model_validate(fields)
+    shaft, (rear, tip) = look.shaft(target), look.line_mm(target)
+    np.testing.assert_allclose(shaft.tip, tip)
+    np.testing.assert_allclose(shaft.along, (tip - rear) / np.linalg.norm(tip - rear))
+    assert shaft.up @ shaft.along == pytest.approx(0, abs=1e-12) and shaft.up[2] > 0
+    assert np.linalg.norm(shaft.ends[1] - tip) == pytest.approx(shaft.radius if shaft.kind == "bevel" else 0)
+    parts = look.parts(np.random.default_rng(1), target, any_stand(np.random.default_rng(2)))
+    steel = np.concatenate([part.mesh.vertices for part in parts if part.slot == "metal"])
+    steel = steel[(steel - tip) @ shaft.along < -10]
+    away = np.linalg.norm(np.cross(steel - tip, shaft.along), axis=1)
+    assert away.max() == pytest.approx(shaft.radius, abs=0.03)
+    assert Look.named("board")().shaft(target) is None
+
+
+def test_a_tube_is_as_its_gauge():
+    """Wall and bore of ISO 9626's 18 gauge; a stylet fills it, and air is known."""
+    target = RIG.bodies["needle"]
+    tube, rod = (needle.Kind(gauge=18, filling=filling).shaft(target) for filling in ("air", "stylet"))
+    assert (2 * tube.radius, 2 * tube.bore, rod.bore) == (1.27, 0.84, 0.0) and tube.filling.speed == pytest.approx(343, abs=3)
+    for gauge, outer in needle.DIAMETERS_MM.items():
+        assert 0.1 < (outer - needle.BORES_MM[gauge]) / 2 < 0.28
+
+
 def test_a_body_looks_like_its_name():
-    assert body_look.look_of("needle").kind == "needle"
+    assert body_look.look_of("needle").kind == "needle" and body_look.look_of("stylus").kind == "stylus"
     assert body_look.look_of("patient").kind == body_look.look_of("thing").kind == "board"
 
 
 def test_nonsense_is_refused_by_name():
+    with pytest.raises(ValidationError, match=r"ball_mm: expected 0, or diameter_mm = 2 to 20, found 1"):
+        Look.model_validate({"kind": "stylus", "ball_mm": 1})
     for field, value, words in (("gauge", 24, "expected one of"), ("direction", (0, 0, 1), "behind the board's face")):
         with pytest.raises(ValidationError, match=words) as caught:
             Look.model_validate({"kind": "needle", field: value})
