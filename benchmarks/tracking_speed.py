@@ -13,7 +13,7 @@ from typing import cast
 
 import numpy as np
 
-from recon.model.rig import Rig
+from recon.model.rig import PROBE, Rig
 from recon.tracking import networks as nets
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
@@ -141,8 +141,9 @@ def filmed(setup: Setup) -> Figures:
     path, rig, scanner = config.path, config.rig, config.ultrasound
     planned = sweep_session.plan_sweep(path, rig, scanned, scanner, config.clocks, config.pose_noise, seed)
     led = scene_frames.motions(*[planned.target.poses(late) for late in (0.0, -0.005, 0.005)])
-    bank = scene_frames.make_bank(scene, rig, led, config.seed)
-    made = scene_frames.takes(bank, rig, few(setup), config.frames, led, seed)
+    stage = scene_frames.SceneStage(scene, np.eye(4), {PROBE: led}, {})
+    bank = scene_frames.make_bank(stage, rig, config.seed)
+    made = scene_frames.takes(stage, bank, rig, few(setup), config.frames, seed)
     list(film_session.shoot(bank, rig, made[:BATCH], config.frames.quality, seed))
     start = perf_counter()
     list(film_session.shoot(bank, rig, made, config.frames.quality, seed))

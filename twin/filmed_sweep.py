@@ -1,14 +1,17 @@
 """A freehand sweep of a scene that both cameras may film: its settings, the probe's way, its B-scans, and the cameras' frames."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from recon.capture.manifest import SweepNameOrNone
-from recon.model.rig import Rig
+from recon.geometry import rigid
+from recon.model.rig import PROBE, Part, Rig, Vector
+from recon.model.tracks import Track
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from twin import swept_bodies
@@ -28,7 +31,23 @@ if TYPE_CHECKING:
     from twin.tracking.rendered_views import Frames
     from twin.tracking.scene_frames import SceneFilm
 
+Array = NDArray[np.float64]
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
+
+
+class Moved(Part):
+    """A rigid step of the patient since the fringes: of the scene, and of all that is led over it and stands beside it."""
+
+    turn_deg: Vector = (0.0, 0.0, 0.0)
+    """deg, rotation vector in the world, about the middle of the scene's first thing"""
+    shift_mm: Vector = (0.0, 0.0, 0.0)
+    """mm, of that middle"""
+
+    def matrix(self, scene: Scene) -> Array:
+        """`world_from_reference` : (4, 4), the reference being the world as it was under the fringes."""
+        middle = scene.things[0].mesh.bounds.mean(axis=0) if scene.things else np.zeros(3)
+        turn = rigid.from_rotation_vector(np.deg2rad(self.turn_deg), np.zeros(3))
+        return rigid.transform(turn[:3, :3], middle + self.shift_mm - turn[:3, :3] @ middle)
 
 
 class SweepSettings(LedBodies):
@@ -43,6 +62,7 @@ class SweepSettings(LedBodies):
     pose_noise: PoseNoise = PoseNoise()
     name: SweepNameOrNone = ""
     filmed: bool = False
+    moved: Moved = Moved()
     frames: FrameShooting = FrameShooting()
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -57,11 +77,6 @@ class SweepSettings(LedBodies):
         if self.filmed and self.frames.exposure_s * self.clocks.camera_hz > 1:
             expected = f"at most 1 / clocks.camera_hz = {1 / self.clocks.camera_hz:.4g}"
             raise ValueError(f"frames.exposure_s: expected {expected}, found {self.frames.exposure_s:g}")
-        if self.filmed and self.rig.bodies:
-            others = ", ".join(self.rig.bodies)
-            raise ValueError(
-                f"rig.bodies: expected none with filmed=true, as sweeps film the probe alone, found {others}: take another rig"
-            )
         if self.filmed and self.seed >= 2**32:
             raise ValueError(f"seed: expected less than 2^32 with filmed=true, found {self.seed}")
         return self
@@ -86,13 +101,17 @@ class SweepSettings(LedBodies):
 
 @dataclass(frozen=True)
 class PlannedSweep:
-    """A sweep before anything is rendered."""
+    """A sweep before anything is rendered.
+
+    What the scanner sees is told in the reference, where nothing has moved, and what the cameras see in their world.
+    """
 
     settings: SweepSettings
     scene: Scene
     scanned: Body  # the scene by sound
     plan: Plan
     bodies: Mapping[str, SweptBody]  # of the rig, besides the probe
+    world_from_reference: Array  # (4, 4) mm, by which the patient has moved
 
     def scans(self) -> Iterator[Scan]:
         """Render the B-scans, one by one."""
@@ -111,19 +130,25 @@ class PlannedSweep:
         """
         from twin.tracking import film_session, scene_frames  # load the ray tracer, which B-scans do without
 
-        settings, target = self.settings, self.plan.target
-        rig = drifted(settings.rig, settings.conditions.drift, settings.seed)
-        rig = rig.model_copy(update={"target": printed(rig.target, settings.conditions.target, settings.seed)})
-        half = settings.frames.exposure_s / 2
-        led = scene_frames.motions(target.poses(), target.poses(-half), target.poses(half))
-        bank = scene_frames.make_bank(self.scene, rig, led, settings.seed)
-        motion = settings.conditions.motion
-        made = scene_frames.takes(bank, rig, ranges, settings.frames, led, settings.own_seed, motion)
+        settings, target, moved = self.settings, self.plan.target, self.world_from_reference
+        errors, seed = settings.conditions.target, settings.seed
+        rig = drifted(settings.rig, settings.conditions.drift, seed)
+        prints = {name: printed(one, errors, seed, number) for number, (name, one) in enumerate(rig.bodies.items(), 1)}
+        rig = rig.model_copy(update={"target": printed(rig.target, errors, seed), "bodies": prints})
+        exposure_s = settings.frames.exposure_s
+        own = scene_frames.motions(target.poses(), target.poses(-exposure_s / 2), target.poses(exposure_s / 2))
+        led = {PROBE: own}
+        for name, one in self.bodies.items():
+            led[name] = [one.way.motion(time * 1e-9, exposure_s) for time in target.times.tolist()]
+        led = {name: [motion.carried(moved) for motion in motions] for name, motions in led.items()}
+        stage = scene_frames.SceneStage(self.scene, moved, led, {name: one.look for name, one in self.bodies.items()})
+        bank = scene_frames.make_bank(stage, rig, seed)
+        made = scene_frames.takes(stage, bank, rig, ranges, settings.frames, settings.own_seed, settings.conditions.motion)
 
         def frames() -> Iterable["Frames"]:
             return shown(film_session.shoot(bank, rig, made, settings.frames.quality, settings.own_seed), len(made))
 
-        return scene_frames.SceneFilm(rig, settings.rig, settings.frames, self.plan.track.times, made, frames)
+        return scene_frames.SceneFilm(rig, settings.rig, settings.frames, self.plan.track.times, made, frames, stage.looks)
 
 
 def plan_sweep(settings: SweepSettings) -> PlannedSweep:
@@ -149,4 +174,13 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     bodies = swept_bodies.lead(
         settings, settings.rig, settings.ultrasound, plan, settings.pose_noise, settings.own_seed, settings.conditions.motion
     )
-    return PlannedSweep(settings, scene, scanned, plan, bodies)
+    moved = settings.moved.matrix(scene)
+    plan = replace(plan, track=_carried(plan.track, moved))
+    bodies = {
+        name: replace(one, track=_carried(one.track, moved), truth=_carried(one.truth, moved)) for name, one in bodies.items()
+    }
+    return PlannedSweep(settings, scene, scanned, plan, bodies, moved)
+
+
+def _carried(track: Track, world_from_reference: Array) -> Track:
+    return replace(track, poses=world_from_reference @ track.poses)

@@ -51,18 +51,20 @@ def lead(
     seed: int,
     errors: conditions.Motion = STILL,
 ) -> Mapping[str, SweptBody]:
-    """Lead the rig's further bodies beside the probe, each by its name; needles to the B-scan if no path is given.
+    """Lead the rig's further bodies beside the probe, each by its name; if no path is given, needles to the B-scan, while what
+    stands stays where it is.
 
     Raises
     ------
     InputError
         If a body finds no path, or an insertion is led by a body without a tip.
     """
+    standing = led.standing(rig)
     face, bodies = mean_pose(scan_lines.world_from_face(transducer, plan.truth.poses) @ _middle(transducer)), {}
     for number, (name, target) in enumerate(rig.bodies.items(), 1):
         look, given = led.look(name), led.bodies.get(name)
         to_image = look.line_mm(target) is not None and (given is None or given.path is None)
-        path = insertion.Kind() if to_image else led.path_of(name, number - 1)
+        path = insertion.Kind() if to_image else standing.get(name) or led.path_of(name, number - 1)
         way = led.lead(name, path, rig, face, seed, errors)
         truth, scanned = (_along(way, moments) for moments in (plan.target.times, plan.truth.times))
         seen = noisy(truth.poses, noise, np.random.default_rng([seed, STREAM, number]))

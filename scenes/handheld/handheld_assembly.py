@@ -19,7 +19,7 @@ from scenes.handheld import lofts
 from scenes.handheld.holders import grip, pinch, robot
 from scenes.handheld.mesh_parts import Part
 from scenes.handheld.probe_bodies import LENS_MM, Body, body, lens, parts_of, scaled
-from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, draw_front, hides, pierces, to_edge
+from scenes.handheld.target_board import CLEAR_MM, Board, build_board, covers, crosses, draw_front, hides, pierces, to_edge
 
 Array = NDArray[np.float64]
 
@@ -66,7 +66,9 @@ def held(rng: np.random.Generator, target: Target, ranges: Ranges | None = None)
     return tuple(parts)
 
 
-def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Array) -> tuple[Part, ...]:
+def as_designed(
+    rng: np.random.Generator, target: Target, probe: Probe, eyes: Array, views: Array | None = None
+) -> tuple[Part, ...]:
     """A body that a rig describes: its board about the circles' middle, its array at the B-scan's top line, held by a hand.
 
     Housing, bracket, hand and cable are drawn. Where no hand is found that leaves the circles free, there is none.
@@ -75,6 +77,8 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
     ----------
     eyes : (n, 3) mm
         Places in the target's frame from which the circles are looked at.
+    views : (m, 2, 3) mm
+        Ends of further lines of sight that a hand leaves free, such as those to other bodies' circles.
 
     Raises
     ------
@@ -96,7 +100,8 @@ def as_designed(rng: np.random.Generator, target: Target, probe: Probe, eyes: Ar
     discs = circle_centres(target)[:, :2]
 
     def in_the_way(balls: Array) -> bool:
-        return pierces(balls, board) or any(hides(balls, eye, discs, target.outer_diameter_mm / 2) for eye in eyes)
+        hidden = any(hides(balls, eye, discs, target.outer_diameter_mm / 2) for eye in eyes)
+        return hidden or pierces(balls, board) or (views is not None and crosses(balls, views, target.outer_diameter_mm / 2))
 
     grips = 160  # of a hand that leaves the circles free
     any_grip = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too

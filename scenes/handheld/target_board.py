@@ -105,3 +105,12 @@ def pierces(points: Array, board: Board) -> bool:
     away = np.maximum(np.maximum(low - points[:, :3], points[:, :3] - high), 0)
     soft = 0.6  # of a finger's radius: what gives way where it is pressed against the board
     return bool((np.linalg.norm(away, axis=1) < soft * points[:, 3]).any())
+
+
+def crosses(balls: Array, views: Array, radius: float) -> bool:
+    """Whether balls : (n, 4) of x, y, z, radius come nearer than a radius to lines of sight : (m, 2, 3)."""
+    start, way = views[:, 0], views[:, 1] - views[:, 0]
+    to_ball = balls[:, None, :3] - start
+    share = np.clip((to_ball * way).sum(axis=-1) / (way**2).sum(axis=-1), 0, 1)
+    away = np.linalg.norm(to_ball - share[..., None] * way, axis=-1)
+    return bool((away < balls[:, 3:] + radius).any())

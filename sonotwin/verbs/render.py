@@ -6,6 +6,9 @@ Takes about five seconds a camera for nine patterns on two cores, and once ten s
 
 With `add=true` other parts of a capture in OUT stay, such as a board, a sweep; without it they are refused.
 
+With a rig that has a body `patient`, or others that stand, such as three_bodies, their boards stand beside the scene, so that
+`sonotwin track` knows where the patient was under the fringes: render both cameras.
+
 With `poses` the scene is the calibration board, held in many poses: lit for each camera, and under the patterns for camera 1.
 Takes about eight seconds a pose on two cores. A run that was stopped goes on where it was when given the same fields again.
 
@@ -25,19 +28,21 @@ from recon.capture.manifest import axes_not_encoded
 from recon.files import atomic
 from recon.geometry.rigid import Array
 from recon.model.patterns import Patterns
-from recon.model.rig import Part, Rig
+from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
 from sonotwin.console_watch import LineConsole
 from twin import board_session
-from twin.conditions import IDEAL, Conditions, check_board, drifted
+from twin.conditions import IDEAL, Conditions, check_board, drifted, printed
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.session import Session
+from twin.standing_bodies import with_standing
+from twin.tracking.led_bodies import LedBodies, check_names
 from twin.working_range import working_range
 
 
-class Config(Part):
+class Config(LedBodies):
     """Fields of `conf/render.yaml`."""
 
     rig: Rig
@@ -63,6 +68,11 @@ class Config(Part):
             adc = getattr(self.rig, camera).sensor.adc_bits
             if self.shooting.bits > adc:
                 raise ValueError(f"shooting.bits: expected at most the {adc} of {camera}'s ADC, found {self.shooting.bits}")
+        return self
+
+    @model_validator(mode="after")
+    def _of_the_rig(self) -> "Config":
+        check_names(self.bodies, self.rig)
         return self
 
     @model_validator(mode="after")
@@ -150,7 +160,10 @@ def render_poses(settings: board_session.Settings, placed: Array, session: Sessi
 def render_surface(config: Config, session: Session, console: Console) -> None:
     """Render each camera's images of the scene under the patterns."""
     session.check()
-    scene, rig = build_scene(config.scene), drifted(config.rig, config.conditions.drift, config.seed)
+    rig, errors = drifted(config.rig, config.conditions.drift, config.seed), config.conditions.target
+    prints = {name: printed(one, errors, config.seed, k) for k, (name, one) in enumerate(rig.bodies.items(), 1)}
+    rig = rig.model_copy(update={"bodies": prints})
+    scene, standing = with_standing(build_scene(config.scene), rig, config, config.seed)
     views = {}
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()
@@ -163,4 +176,4 @@ def render_surface(config: Config, session: Session, console: Console) -> None:
             f"render      {camera}, {config.patterns.count} patterns, {config.tracing.samples} samples/px, "
             f"exposure {view.exposure.time_s * 1e3:.2f} ms, {perf_counter() - start:.1f} s"
         )
-    surface_session.write_session(session, rig, config.rig, scene, config.patterns, views)
+    surface_session.write_session(session, rig, config.rig, scene, config.patterns, views, standing)

@@ -8,7 +8,8 @@ default stroke, and a minute more when it first compiles. With `add=true` other 
 they are refused. A capture holds several sweeps if each has a `name`.
 
 With `filmed=true` both cameras film the sweep, too: the rig's board, bracket and probe in a hand, over the very scene. The poses
-are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more.
+are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more. Frames show further
+bodies of the rig, too. With `moved` the patient, the scene and all over it, has moved by a rigid step since the fringes.
 
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
 B-scans that they are led to.

@@ -1,12 +1,24 @@
 """`sonotwin render`: what it writes, and what it refuses before it renders."""
 
 import json
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from recon.capture import calibration_files
 from recon.capture.board_part import read_board
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.model import circle_layout
+from scenes.catalogue import build_scene
+from scenes.handheld import lofts
+from scenes.scene_types import Material, Thing
+from sonotwin import read_rig
 from sonotwin.cli import main
+from twin.standing_bodies import with_standing
+from twin.tracking.led_bodies import LedBodies
 
 SMALL = [  # both cameras at an eighth of their size
     "rig.cam1.sensor.pixel_um=38.4",
@@ -112,3 +124,45 @@ def test_a_board_in_poses(tmp_path, capsys):
     assert 0.01 < apart[:, :2].std() < 0.04 and 0.1 < np.abs(apart[:, 2]).max() <= 0.2
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["capture", "truth"]
     assert "2 poses, 50 patterns, 2 samples/px" in capsys.readouterr().out
+
+
+def test_a_board_that_stands_beside_the_scene_is_under_the_fringes(tmp_path):
+    """Its rings are dark and its holes bright where the truth has them, in both views; what a hand holds isn't there."""
+    fields = ["rig=three_bodies", "scene=plane", "scene.centre_mm=[4,-2,700]", "cameras=[cam1,cam2]", *SMALL]
+    assert main(["render", f"out={tmp_path}", *fields]) == 0
+    bodies = tmp_path / "truth" / "surface" / "bodies"
+    assert [path.name for path in bodies.iterdir()] == ["patient.npz"]
+    pose = np.load(bodies / "patient.npz")["world_from_target"]
+    target = read_rig("three_bodies").bodies["patient"]
+    cameras = calibration_files.read(tmp_path / "truth" / "calibration" / "optics.yaml").cameras
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(40)])
+    middle_mm = (target.outer_diameter_mm + target.inner_diameter_mm) / 4  # of the ring
+    for name in ("cam1", "cam2"):
+        images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((tmp_path / "capture/surface" / name).iterdir())]
+        mean = np.mean(images, axis=0, dtype=np.float32)
+        for centre in circle_layout.circle_centres(target):
+            ring, hole = (
+                cv2.remap(
+                    mean, *np.float32(cameras[name].project(rigid.apply(pose, centre + r * circle)).T), cv2.INTER_LINEAR
+                ).mean()
+                for r in (middle_mm, 0.2 * middle_mm)
+            )
+            assert hole > 3 * ring
+
+
+def test_a_board_stands_on_what_lies_below_it():
+    """On its foot, on a block that is as high as a plane, and on a higher one."""
+    rig, led = read_rig("three_bodies"), LedBodies()
+    for step_mm in (0.0, 15.0):
+        plane = build_scene({"kind": "plane", "centre_mm": [4, -2, 720.0]})
+        box = lofts.box([60, 60, step_mm + 1], [-82, 66, 720.5 - step_mm / 2])  # the lower 1 mm of it in the plane
+        scene = replace(plane, things=(*plane.things, Thing("block", box, Material(0.5), smooth=False)))
+        whole, poses = with_standing(scene, rig, led, 3)
+        parts = [thing.mesh for thing in whole.things if thing.name.startswith("patient")]
+        assert list(poses) == ["patient"] and len(parts) == len(whole.things) - len(scene.things)
+        assert max(mesh.bounds[1, 2] for mesh in parts) == pytest.approx(720 - step_mm, abs=0.01)
+        assert all(mesh.is_watertight for mesh in parts)
+    with pytest.raises(InputError, match=r"bodies\.third\.path: needs a value: 2 bodies stand beside what is scanned"):
+        others = dict.fromkeys(("first", "second", "third"), rig.target)
+        with_standing(plane, rig.model_copy(update={"bodies": others}), led, 3)

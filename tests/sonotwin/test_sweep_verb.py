@@ -1,17 +1,21 @@
 """`sonotwin sweep`: what it writes, what the pipeline makes of it, and what it refuses before it renders."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from recon.capture import sweep_tables
 from recon.capture.manifest import Device, read_manifest
 from recon.capture.sweep_part import read_sweep
 from recon.files import volumes
 from recon.geometry import rigid
 from recon.model.patterns import CentreLine, Fringes, Patterns
+from recon.model.tracks import Track
+from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from sonotwin import config
 from sonotwin.cli import main
@@ -19,6 +23,7 @@ from sonotwin.verbs.sweep import Config, led_along
 from tests import added
 from tests.twin import small_rigs
 from twin.evaluation import track_errors
+from twin.filmed_sweep import Moved
 from twin.session import Session, describe
 from twin.ultrasound import scan_lines
 
@@ -225,6 +230,30 @@ def test_the_frames_of_a_filmed_sweep_show_board_and_table(filmed):
     image = cv2.imread(str(filmed / "capture" / "sweep" / "scan" / "cam1" / "0002.png"), cv2.IMREAD_GRAYSCALE)
     assert image.shape == PART[::-1]
     assert np.percentile(image, 99) > 80 and np.percentile(image, 10) < 30
+
+
+@pytest.mark.slow
+def test_a_patient_who_moved_is_taken_out_of_the_probes_poses(tmp_path):
+    """By 20 mm and 5 deg since the reference: frames show it, and poses told beside the patient don't, to the tracker's error."""
+    rig = ["rig=meza2021", "+target@rig.bodies.patient=patient"]
+    fields = ["scene=breast", "path.end_mm=[4,-25]", "path.hand.turn_deg=0", "clocks.scanner_hz=4", "clocks.camera_hz=4"]
+    fields += ["filmed=true", "name=scan", "moved={turn_deg: [0, 3, 4], shift_mm: [12, 16, 0]}", *small(48, 128)]
+    assert main(["sweep", f"out={tmp_path}", *rig, *fields]) == 0
+    truth, folder = track_errors.read_truth(tmp_path / "truth", "scan"), tmp_path / "truth" / "sweep" / "scan"
+    step = Moved(turn_deg=(0, 3, 4), shift_mm=(12, 16, 0)).matrix(
+        build_scene(config.load("sweep", ["out=unused"], Config).scene)
+    )
+    with np.load(folder / "bodies" / "patient.npz") as patient:
+        assert (patient["visible"] > 0.99).all()
+        first = rigid.invert(step) @ patient["world_from_target"][:1]
+    sweep_tables.write_track(tmp_path / "reference.csv", Track(truth.times[:1], first))
+    given = [f"capture={tmp_path / 'capture'}", "sweep=scan", f"reference={tmp_path / 'reference.csv'}", "overlays=false"]
+    assert main(["track", *rig, *given, f"out={tmp_path / 'track'}"]) == 0
+    track = track_errors.read_track(tmp_path / "track" / "poses.csv", truth)
+    moved = track_errors.compare(track, truth)
+    told = track_errors.compare(track, replace(truth, poses=rigid.invert(step) @ truth.poses))
+    assert told.found.all() and moved.shift_mm.min() > 15 and moved.turn_deg.min() > 4
+    assert told.shift_mm.max() < 0.6, "0.1 deg of the patient's target over 200 mm are 0.35 mm"
 
 
 PHASED = '''

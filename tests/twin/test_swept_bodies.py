@@ -80,6 +80,31 @@ def test_the_needle_is_seen_in_the_b_scans_at_its_tip(tmp_path):
             assert abs(beside) < 0.8 and image[near].max() > other[near].max() + 15
 
 
+def test_a_patient_who_moved_carries_scene_probe_and_bodies(tmp_path):
+    """The scanner sees the same, the cameras see all moved by one step about the phantom's middle."""
+    still, moved = planned(), planned("moved={turn_deg: [0, 3, 4], shift_mm: [12, -16, 0]}")
+    step, middle = moved.world_from_reference, still.scene.things[0].mesh.bounds.mean(axis=0)
+    np.testing.assert_array_equal(still.world_from_reference, np.eye(4))
+    np.testing.assert_allclose(rigid.apply(step, middle) - middle, [12, -16, 0], atol=1e-9)
+    assert np.degrees(np.linalg.norm(rigid.difference(np.eye(4), step)[:3])) == pytest.approx(5)
+    np.testing.assert_array_equal(moved.plan.truth.poses, still.plan.truth.poses)
+    np.testing.assert_allclose(moved.plan.track.poses, step @ still.plan.track.poses)
+    for name, one in moved.bodies.items():
+        np.testing.assert_allclose(one.truth.poses, step @ still.bodies[name].truth.poses)
+        np.testing.assert_allclose(one.track.poses, step @ still.bodies[name].track.poses)
+        np.testing.assert_array_equal(one.scanned.poses, still.bodies[name].scanned.poses)
+
+
+def test_what_stands_beside_the_scene_keeps_still():
+    """As the phantom does, whose motion it is to tell; unless a path is given."""
+    one, led = (
+        planned().bodies["patient"],
+        planned("bodies.patient={path: {kind: hand, places_mm: [[0,0,650],[9,0,650],[0,9,650]]}}"),
+    )
+    assert np.ptp(one.truth.poses, axis=0).max() < 1e-9
+    assert np.ptp(led.bodies["patient"].truth.poses[:, :3, 3], axis=0).max() > 3
+
+
 def test_the_mean_of_poses_is_the_one_they_scatter_about(rng):
     pose = rigid.from_rotation_vector([0.3, -2.0, 0.8], [3.0, -40.0, 600.0])
     scattered = np.stack(

@@ -51,6 +51,8 @@ def measure(result: Path, capture: Path, truth: Path) -> Metrics:
         poses = result / "poses" / name
         if poses.is_dir() and set(CAMERAS) <= part.images.keys():
             expected = track_errors.read_truth(truth, name)
+            if part.purpose in ("volume", None):
+                expected = track_errors.beside_patient(expected, truth, name)
             errors = track_errors.compare(track_errors.read_track(poses / "poses.csv", expected), expected)
             figures |= {f"{name}_{key}": value for key, value in track_errors.measure(errors, expected).items()}
         if part.purpose == "volume" and SCANNER in part.images and (result / "masses" / name).is_dir():

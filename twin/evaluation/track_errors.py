@@ -1,6 +1,6 @@
 """Errors of a tracker's poses against those that a film was rendered from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.geometry import rigid
-from recon.model.rig import PROBE
+from recon.model.rig import PATIENT, PROBE
 from recon.model.tracks import Track
 from twin.session import TruthFolder
 from twin.tracking.film_session import truth_name
@@ -74,6 +74,28 @@ def read_truth(folder: Path, name: str = "", body: str = PROBE) -> FilmTruth:
     part = sweep_part(name)
     content = TruthFolder(folder, part).arrays(f"{part}/{truth_name(body)}", forms)
     return FilmTruth(*(content[name] for name in forms))
+
+
+def beside_patient(expected: FilmTruth, folder: Path, name: str = "") -> FilmTruth:
+    """The truth of a sweep told as `sonotwin track` tells poses: as if the patient stood where it stood under the fringes.
+
+    Without the patient's truth the same; without fringes the patient stood as in the first frame.
+
+    Raises
+    ------
+    InputError
+        If a file is damaged.
+    """
+    forms = {"world_from_target": Form("f", (None, 4, 4))}
+    part, surface = sweep_part(name), f"surface/{truth_name(PATIENT)}"
+    own = f"{part}/{truth_name(PATIENT)}"
+    if not (folder / own).is_file():
+        return expected
+    seen = TruthFolder(folder, part).arrays(own, forms)["world_from_target"]
+    reference = seen[0]
+    if (folder / surface).is_file():
+        reference = TruthFolder(folder, "surface").arrays(surface, {"world_from_target": Form("f", (4, 4))})["world_from_target"]
+    return replace(expected, poses=reference @ np.linalg.inv(seen) @ expected.poses)
 
 
 def read_track(poses: Path, expected: FilmTruth) -> Track:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import numpy as np
@@ -146,11 +147,18 @@ def calibration_of(rig: Rig) -> Calibration:
 
 
 def write_session(
-    session: Session, rig: Rig, calibrated: Rig, scene: Scene, patterns: Patterns, views: Mapping[CameraName, View]
+    session: Session,
+    rig: Rig,
+    calibrated: Rig,
+    scene: Scene,
+    patterns: Patterns,
+    views: Mapping[CameraName, View],
+    standing: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> None:
     """Write a surface and its truth; a calibration that has been measured for a capture that is added to stays in it.
 
     rig, calibrated : as it took the images, and as it was when it was calibrated.
+    standing : poses `world_from_target` : (4, 4) mm of bodies beside the scene, by name
     """
     devices = {"projector": Device(size=patterns.projector_size)}
     for camera, view in views.items():
@@ -160,6 +168,8 @@ def write_session(
         for camera, view in views.items():
             arrays: dict[str, NDArray] = {field.name: getattr(view.truth, field.name) for field in fields(view.truth)}
             truth.write_arrays(f"surface/{camera}.npz", {**arrays, "limit_px": view.limit_px})
+        for name, pose in standing.items():
+            truth.write_arrays(f"surface/bodies/{name}.npz", {"world_from_target": pose})
         capture.complete_calibration(calibration_of(calibrated))
         capture.add_surface({camera: view.images for camera, view in views.items()}, patterns, devices)
 

@@ -11,13 +11,15 @@ from recon.model.rig import BodyName, Part, Rig
 from scenes.handheld.body_look import Look, look_of
 from twin import conditions
 from twin.tracking.film_path import STILL, Aimed, FilmPath, Way
-from twin.tracking.film_paths import hand
+from twin.tracking.film_paths import hand, still
 
 Array = NDArray[np.float64]
 
 # of bodies that no path is given for, beside the probe's usual one: the first above, the second below, facing the cameras
 PLACES_MM = ((70.0, -46.0, 660.0), (76.0, 46.0, 668.0))
 ROLLS_DEG = (75.0, 20.0)
+# beside what is scanned, where neither the probe's board nor the phantom hides one that stands there
+STANDS_MM = ((-82.0, 66.0, 652.0), (-82.0, -66.0, 652.0))
 BREATH_MM, BREATH_S, SWAY_MM = 1.5, 4.0, 12.0  # by which a body on a post moves, in what time, and by which a hand does
 
 
@@ -48,6 +50,29 @@ class LedBodies(Part):
         """
         given = self.bodies.get(name)
         return beside(name, number, self.look(name)) if given is None or given.path is None else given.path
+
+    def standing(self, rig: Rig) -> dict[str, FilmPath]:
+        """Paths of the bodies that stand beside what is scanned, by name: at rest, if none is given.
+
+        Raises
+        ------
+        InputError
+            If there is no room left for one without a path.
+        """
+        paths, places = dict[str, FilmPath](), iter(STANDS_MM)
+        for name in rig.bodies:
+            given = self.bodies.get(name)
+            if self.look(name).IN_A_HAND:
+                continue
+            if given is not None and given.path is not None:
+                paths[name] = given.path
+            elif place := next(places, None):
+                paths[name] = still.Kind(place_mm=place)
+            else:
+                raise InputError(
+                    f"bodies.{name}.path: needs a value: {len(STANDS_MM)} bodies stand beside what is scanned, this is another"
+                )
+        return paths
 
     def lead(self, name: str, path: FilmPath, rig: Rig, world_from_face: Array, seed: int, errors: conditions.Motion) -> Way:
         """Lead a body of the rig along a path.

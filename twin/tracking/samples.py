@@ -56,6 +56,11 @@ class Motion:
         """The same over an exposure that is later by a share of itself."""
         return Motion(self.at(share), self.shift_mm, self.turn_rad) if share else self
 
+    def carried(self, moved: Array) -> "Motion":
+        """The same where all has moved by a rigid transform : (4, 4) mm of the world."""
+        turn = moved[:3, :3]
+        return Motion(moved @ self.world_from_target, turn @ self.shift_mm, turn @ self.turn_rad)
+
     def at(self, time: float) -> Array:
         """`world_from_target` at a time from -1/2 to 1/2 of the exposure."""
         return rigid.moved(self.world_from_target, time * np.concatenate([self.turn_rad, self.shift_mm]))

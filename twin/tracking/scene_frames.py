@@ -1,10 +1,10 @@
-"""Frames of a sweep: both cameras see the rig's own body, led by a hand, over the very scene that is scanned.
+"""Frames of a sweep: both cameras see the rig's own probe, led by a hand, and further bodies over the very scene that is scanned.
 
-The body is built from `rig.target` and `rig.probe`, so that its array lies where the B-scans begin. Of some bodies the one is
-taken whose hand, bracket and cable cover least of the circles.
+The probe is built from `rig.target` and `rig.probe`, so that its array lies where the B-scans begin. Of some variants the one is
+taken whose hand, bracket and cable cover least of the circles. What stands beside it stands on the table, or the phantom.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,26 +14,29 @@ from numpy.typing import NDArray
 from recon.capture.manifest import Device
 from recon.capture.writer import CaptureWriter
 from recon.geometry import rigid
-from recon.model.rig import Rig
+from recon.model import circle_layout
+from recon.model.rig import PROBE, Rig
 from scenes.handheld import lofts
+from scenes.handheld.body_look import Look, Stand
 from scenes.handheld.handheld_assembly import as_designed
 from scenes.handheld.mesh_parts import Part
+from scenes.handheld.standing_things import stand_at
 from scenes.handheld.surroundings import BENCH_MM, FLOAT_MM, Surroundings
 from scenes.scene_types import Scene, Thing
 from twin import conditions
 from twin.session import TruthFolder
 from twin.shooting import FrameShooting
 from twin.tracking import film_session
-from twin.tracking.film_session import LOOKS, STILL, Seen, in_a_row
-from twin.tracking.mesh_bank import Bank, bank_of, uncovered
+from twin.tracking.film_session import FAR_LAMPS_MM, LOOKS, STILL, Seen, in_a_row
+from twin.tracking.mesh_bank import Bank, bank_of, uncovered, uncovered_share
 from twin.tracking.rendered_views import Frames
-from twin.tracking.samples import LAMPS, Lighting, Motion, Take, draw
+from twin.tracking.samples import LAMPS, Held, Lighting, Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.study_samples import CLEAN
 
 Array = NDArray[np.float64]
 
-BODIES, DRAWN = 2, 6  # bodies in a hand to choose from, and bodies that are drawn at most to have them
+BODIES, DRAWN = 2, 6  # bodies in a hand to choose from, and those drawn at most to have them, or not to cover further bodies
 AROUND = 0.1  # of the target's light, from all around, beside a projector in the dark
 
 
@@ -47,6 +50,7 @@ class SceneFilm:
     times: NDArray[np.int64]  # (m,) ns
     made: Sequence[Take]
     frames: Callable[[], Iterable[Frames]]  # renders them one by one
+    looks: Mapping[str, Look]  # of further bodies
     seen: list[Seen] = field(default_factory=list)
 
     @property
@@ -62,25 +66,47 @@ class SceneFilm:
         """Write the calibration, and the truth of what was rendered."""
         truth.write_optics(film_session.cameras_of(self.rig))
         capture.complete_calibration(film_session.cameras_of(self.calibrated))
-        arrays = film_session.truth_arrays(self.times, self.made, self.seen)
-        truth.write_arrays(f"{truth.part}/{film_session.TRUTH}", arrays)
+        for name in self.made[0].held:
+            tip = self.looks[name].tip_mm(self.rig.targets[name]) if name in self.looks else None
+            arrays = film_session.truth_arrays(self.times, self.made, self.seen, name) | ({} if tip is None else {"tip_mm": tip})
+            truth.write_arrays(f"{truth.part}/{film_session.truth_name(name)}", arrays)
 
 
-def make_bank(scene: Scene, rig: Rig, led: Sequence[Motion], seed: int) -> Bank:
-    """The bodies that one is chosen from for some motions, and the scene, in the world's frame.
+@dataclass(frozen=True, eq=False)
+class SceneStage:
+    """What is filmed: a scene that has moved, and all bodies over n frames."""
+
+    scene: Scene
+    world_from_reference: Array  # (4, 4) mm, by which it has moved
+    motions: Mapping[str, Sequence[Motion]]  # in the world, the probe's first
+    looks: Mapping[str, Look]  # of the others
+
+    def stand(self, name: str, parts: Sequence[Part], rig: Rig) -> Stand:
+        """Where a body stands in the first frame, on what lies below it of the scene; an arm leads away from all bodies."""
+        first = {other: motions[0].world_from_target for other, motions in self.motions.items()}
+        middles = [rigid.apply(pose, circle_layout.middle(rig.targets[other])) for other, pose in first.items()]
+        meshes, eyes = [part.mesh for part in parts], _eyes(rig, self.motions[name])
+        return stand_at(first[name], rig.targets[name], meshes, eyes, np.mean(middles, axis=0), self.world_from_reference)
+
+
+def make_bank(stage: SceneStage, rig: Rig, seed: int) -> Bank:
+    """The probes that one is chosen from, further bodies, and the scene, as it was in the reference.
 
     Raises
     ------
     InputError
         If `rig.probe` stands where its housing would pierce the target's board.
     """
-    drawn, eyes = [], _eyes(rig, led)
+    drawn, eyes, wanted = [], _eyes(rig, stage.motions[PROBE]), DRAWN if stage.looks else BODIES
     for rng in np.random.default_rng([seed, 4]).spawn(DRAWN):
-        drawn.append(as_designed(rng, rig.target, rig.probe, eyes))
-        if sum(map(_in_a_hand, drawn)) == BODIES:
+        drawn.append(as_designed(rng, rig.target, rig.probe, eyes, _views(rig, stage)))
+        if sum(map(_in_a_hand, drawn)) == wanted:
             break
-    bodies = [body for body in drawn if _in_a_hand(body)] or drawn
-    return bank_of(bodies, [Surroundings(tuple(parts_of(scene)), ())])
+    bodies, parts = [body for body in drawn if _in_a_hand(body)] or drawn, parts_of(stage.scene)
+    for number, (name, look) in enumerate(stage.looks.items(), 1):
+        rng = np.random.default_rng([seed, 4, number])
+        bodies.append(look.parts(rng, rig.targets[name], stage.stand(name, parts, rig)))
+    return bank_of(bodies, [Surroundings(tuple(parts), ())])
 
 
 def _in_a_hand(body: Sequence[Part]) -> bool:
@@ -110,35 +136,75 @@ def motions(poses: Array, before: Array, after: Array) -> list[Motion]:
     return [Motion(pose, step[3:], step[:3]) for pose, step in zip(poses, steps, strict=True)]
 
 
+def _views(rig: Rig, stage: SceneStage) -> Array | None:
+    """Lines of sight : (m, 2, 3) mm of both cameras to the circles of further bodies, in the probe's target's frame, in some of
+    the frames; None without such bodies.
+    """
+    lines = []
+    for k in _looked(len(stage.motions[PROBE])):
+        into = rigid.invert(stage.motions[PROBE][k].world_from_target)
+        for name in stage.looks:
+            pose = into @ stage.motions[name][k].world_from_target
+            circles = rigid.apply(pose, circle_layout.circle_centres(rig.targets[name]))
+            for device in (rig.cam1, rig.cam2):
+                eye = rigid.apply(into, device.optics.camera().centre)
+                lines.append(np.stack([np.tile(eye, (len(circles), 1)), circles], axis=1))
+    return np.concatenate(lines) if lines else None
+
+
 def takes(
+    stage: SceneStage,
     bank: Bank,
     rig: Rig,
     ranges: DataRanges,
     shooting: FrameShooting,
-    led: Sequence[Motion],
     seed: int,
     errors: conditions.Motion = STILL,
 ) -> list[Take]:
-    """Parameters of each pair of frames: surfaces and light are drawn once, as for a data set's sample; the print is clean."""
-    light = ranges.light.model_copy(update={"projector_share": 0.0})
+    """Parameters of each pair of frames: surfaces and light are drawn once, as for a data set's sample; prints are clean."""
+    light = ranges.light.model_copy(update={"projector_share": 0.0} | ({"lamp_mm": FAR_LAMPS_MM} if stage.looks else {}))
     drawn = draw(ranges.model_copy(update={"variants": BODIES, "light": light}), rig, seed, 0)
-    middle, eyes = np.mean([motion.world_from_target[:3, 3] for motion in led], axis=0), _eyes(rig, led)
+    led = stage.motions[PROBE]
+    middle = np.mean([motion.world_from_target[:3, 3] for motion in led], axis=0)
+    probes = len(bank.body_at) - len(stage.looks)
+    lines = {name: look.line_mm(rig.targets[name]) for name, look in stage.looks.items()}
+    others = [
+        {
+            name: Held(stage.motions[name][k], number, CLEAN, line=line)
+            for number, (name, line) in enumerate(lines.items(), probes)
+        }
+        for k in range(len(led))
+    ]
     same = replace(
         drawn,
         cameras=(rig.cam1, rig.cam2),
         present=True,
-        body=int(np.argmax([uncovered(bank, body, rig.target, eyes) for body in range(len(bank.body_at))])),
         surroundings=0,
-        scene_from_world=np.eye(4),
+        scene_from_world=rigid.invert(stage.world_from_reference),
         lighting=_lighting(drawn, middle, rig, shooting.light),
         face=CLEAN,
     )
-    return in_a_row(same, led, rig, shooting, seed, errors)
+    if stage.looks:
+        centres = np.array([device.optics.camera().centre for device in same.cameras])
+        some = [replace(same, motion=led[k], others=others[k]) for k in _looked(len(led))]
+        shares = [
+            np.mean([uncovered_share(bank, replace(take, body=body), rig.targets, centres) for take in some])
+            for body in range(probes)
+        ]
+    else:
+        shares = [uncovered(bank, body, rig.target, _eyes(rig, led)) for body in range(probes)]
+    made = in_a_row(replace(same, body=int(np.argmax(shares))), led, rig, shooting, seed, errors)
+    return [replace(take, others=its) for take, its in zip(made, others, strict=True)]
+
+
+def _looked(count: int) -> NDArray[np.int64]:
+    """Numbers of some of so many frames."""
+    return np.linspace(0, count - 1, min(LOOKS, count)).astype(int)
 
 
 def _eyes(rig: Rig, led: Sequence[Motion]) -> Array:
     """Where both cameras stand in some of the motions : (n, 3) mm, in the target's frame."""
-    some = [led[k].world_from_target for k in np.linspace(0, len(led) - 1, min(LOOKS, len(led))).astype(int)]
+    some = [led[k].world_from_target for k in _looked(len(led))]
     centres = [device.optics.camera().centre for device in (rig.cam1, rig.cam2)]
     return np.array([rigid.apply(rigid.invert(pose), centre) for pose in some for centre in centres])
 

@@ -133,6 +133,27 @@ def test_the_array_s_face_lies_where_the_b_scan_begins(designed, rig):
         assert face[:, 2].mean() == pytest.approx(0.0, abs=0.1), "the image plane is in the middle of the lens"
 
 
+@pytest.mark.slow
+def test_a_hand_leaves_lines_of_sight_free(rig):
+    """To a board beside the probe, which hands of the same draws cover else; no line of sight comes to skin or sleeve."""
+    there, ways = np.array([-150.0, 60.0, -40.0]) + 9 * np.random.default_rng(3).standard_normal((30, 3)), EYES[[0, 1] * 15]
+    views, met = np.stack([ways, there], axis=1), []
+    for free in (None, views):
+        made = [as_designed(np.random.default_rng([7, k]), rig.target, rig.probe, EYES, free) for k in range(8)]
+        hands = [[part.mesh for part in parts if part.slot in ("skin", "sleeve")] for parts in made]
+        assert sum(map(bool, hands)) > 2
+        met.append([_meets(trimesh.util.concatenate(hand), views) for hand in hands if hand])
+    assert any(met[0]) and not any(met[1])
+
+
+def _meets(mesh, views):
+    """Whether points of a mesh lie within 5 mm of lines of sight."""
+    way = views[:, 1] - views[:, 0]
+    to_point = mesh.vertices[:, None] - views[:, 0]
+    share = np.clip((to_point * way).sum(-1) / (way**2).sum(-1), 0, 1)
+    return (np.linalg.norm(to_point - share[..., None] * way, axis=-1) < 5).any()
+
+
 def test_a_designed_body_has_the_board_of_the_rig_behind_it(designed, rig):
     middle = np.array([rig.target.c1_mm, rig.target.c2_mm]) / 2
     for parts in designed:

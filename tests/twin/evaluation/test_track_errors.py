@@ -1,5 +1,7 @@
 """Are a tracker's errors what they are said to be, and its bounds where they should be?"""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,22 @@ def test_errors_are_those_that_were_made(rng):
     assert figures["track_shift_median_mm"] == pytest.approx(figures["track_shift_expected_mm"], rel=0.15)
     assert (figures["track_found"], figures["track_visible"], figures["track_visible_found"]) == (399, 400, 399)
     assert figures["track_false"] == 0 and figures["track_blur_most_px"] == 4
+
+
+def test_a_patients_motion_is_no_error_of_poses_told_beside_it(tmp_path):
+    """Whatever the patient did since the fringes, the probe is told where it was on the patient."""
+    expected, moves = truth(3), [[0, 0, 0.05], [0.02, -0.1, 0], [0.1, 0, 0]]
+    patient = rigid.from_rotation_vector([2.8, 0.1, 0.0], [-80, 60, 650])
+    carried = np.stack([rigid.from_rotation_vector(turn, [20, 3 * k, -5]) for k, turn in enumerate(moves)])
+    assert track_errors.beside_patient(expected, tmp_path, "scan") is expected
+    for folder, poses in (("surface", patient), ("sweep/scan", carried @ patient)):
+        (tmp_path / folder / "bodies").mkdir(parents=True)
+        np.savez(tmp_path / folder / "bodies" / "patient.npz", world_from_target=poses)
+    told = track_errors.beside_patient(replace(expected, poses=carried @ expected.poses), tmp_path, "scan")
+    np.testing.assert_allclose(told.poses, expected.poses, atol=1e-9)
+    (tmp_path / "surface" / "bodies" / "patient.npz").unlink()
+    told = track_errors.beside_patient(replace(expected, poses=carried @ expected.poses), tmp_path, "scan")
+    np.testing.assert_allclose(told.poses, carried[0] @ expected.poses, atol=1e-9)
 
 
 def test_what_is_found_elsewhere_is_false():
