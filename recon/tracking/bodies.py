@@ -5,7 +5,7 @@ where their rays meet, distances tell the bodies (`recon.tracking.constellations
 then left to its own tracker's search, among the circles that are left.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple
@@ -39,16 +39,42 @@ class _Claim(NamedTuple):
 
 
 @dataclass
+class _Search:
+    """A search for what is lost, in a pair."""
+
+    parts: Iterator[None]
+    settled: dict[str, Tracking]  # by the parts that were done, and not taken yet
+    ended: bool = False
+
+    def advanced(self, whole: bool = False) -> dict[str, Tracking]:
+        """Results that the next part settles, or all parts that are left."""
+        for _ in self.parts:
+            if not whole:
+                break
+        else:
+            self.ended = True
+        settled = dict(self.settled)
+        self.settled.clear()
+        return settled
+
+
+@dataclass
 class BodyTracker:
     """Follows several bodies through pairs of frames; see `Tracker`, of which each body has one."""
 
     trackers: Mapping[str, Tracker]  # by the body's name, all of the same cameras and networks
-    search_s: float = 0.0  # least time from one search for what is lost to the next, while another body is followed
-    _searched: float | None = field(default=None, init=False)
+    search_s: float = 0.0  # live: least time from one search to the next, of which a pair takes a part, while a body is followed
+    _search: _Search | None = field(default=None, init=False)  # that goes on
+    _searched: float | None = field(default=None, init=False)  # when the last one began
     _looked: float | None = field(default=None, init=False)  # when further bodies of the designs were looked for
 
     def step(self, left: NDArray, right: NDArray, time_s: float | None = None) -> dict[str, Tracking]:
-        """Track one pair of frames, camera 1's and camera 2's, as `Tracker.step`; the result of each body by its name."""
+        """Track one pair of frames, camera 1's and camera 2's, as `Tracker.step`; the result of each body by its name.
+
+        A search for what is lost is of this pair, and whole. With `search_s`, while another body is followed, its first part
+        alone is, which finds bodies that both views show whole; each of the next pairs does another part of it. What these find
+        is looked for there in the pair that follows.
+        """
         start = perf_counter()
         first = next(iter(self.trackers.values()))
         (moment, *_) = [tracker.begin(time_s) for tracker in self.trackers.values()]
@@ -58,21 +84,32 @@ class BodyTracker:
             return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
         results = self._followed(frames, moment)
         found = {name: result for name, result in results.items() if result.found}
+        there: dict[str, Tracking] = {}  # found in an earlier pair
         if first.networks is not None:
-            look = self._looked is None or not 0 <= moment.now - self._looked < moment.look
-            if look or self._search_is_due(found, moment, time_s is not None):
-                results |= self._searched_for(Detections(frames, first.networks, CIRCLES, named=False), found)
-                self._searched, self._looked = moment.now, moment.now if look else self._looked
+            in_parts = bool(found) and time_s is not None and self.search_s > 0
+            if self._search_is_due(found, moment, in_parts):
+                search = self._begun(Detections(frames, first.networks, CIRCLES, named=False), found)
+                results |= search.advanced(whole=not in_parts)
+                if not in_parts or self._search is None:
+                    self._search = search
+            elif self._search is not None:
+                earlier = self._search.advanced()
+                there = {name: one for name, one in earlier.items() if one.found and name not in found}
+                results |= {name: one for name, one in earlier.items() if not one.found} | _beside(found, earlier)
+            if self._search is not None and self._search.ended:
+                self._search = None
         reason = NO_NETWORKS if first.networks is None else WAITING
         kept = {
             name: tracker.keep(results.get(name) or tracker.unseen(reason), moment) for name, tracker in self.trackers.items()
         }
+        for name, one in there.items():
+            self.trackers[name].keep(one, moment)
         seconds = {"bodies": (perf_counter() - start) / len(kept)}
         return {name: replace(result, seconds=seconds) for name, result in kept.items()}
 
     def forget(self) -> None:
         """Clear the last poses."""
-        self._searched = self._looked = None
+        self._search = self._searched = self._looked = None
         for tracker in self.trackers.values():
             tracker.forget()
 
@@ -87,22 +124,34 @@ class BodyTracker:
             name: self.trackers[name].follow(frames, each, own) for (name, each), own in zip(sought.items(), rims, strict=True)
         }
 
-    def _search_is_due(self, found: Mapping[str, Tracking], moment: Moment, timed: bool) -> bool:
-        """Whether to search for what is lost."""
-        if len(found) == len(self.trackers):
+    def _search_is_due(self, found: Mapping[str, Tracking], moment: Moment, in_parts: bool) -> bool:
+        """Whether to begin a search: for what is lost, or now and then for further bodies of the designs."""
+        look = self._looked is None or not 0 <= moment.now - self._looked < moment.look
+        waiting = in_parts and self._searched is not None and 0 <= moment.now - self._searched < self.search_s
+        if not look and (waiting or len(found) == len(self.trackers)):
             return False
-        waiting = found and timed and self._searched is not None and 0 <= moment.now - self._searched < self.search_s
-        return not waiting
+        self._searched, self._looked = moment.now, moment.now if look else self._looked
+        return True
 
-    def _searched_for(self, detections: Detections, found: Mapping[str, Tracking]) -> dict[str, Tracking]:
-        """Results of the bodies that aren't found yet, and those of the others with further bodies of their design.
+    def _begun(self, detections: Detections, found: Mapping[str, Tracking]) -> _Search:
+        """A search that has begun."""
+        settled: dict[str, Tracking] = {}
+        return _Search(self._parts(detections, found, settled), settled)
+
+    def _parts(self, detections: Detections, found: Mapping[str, Tracking], told: dict[str, Tracking]) -> Iterator[None]:
+        """Parts of a search; each adds what it settles to `told`: results of the bodies that aren't found yet, and those of the
+        others with further bodies of their design.
 
         Bodies that both views show whole come first; then those of which both show two circles, and the others are sought about
         them; then each lost one's own tracker searches among what is left. At each stage, where two bodies fit, neither is told.
         """
         for result in found.values():
             _take(detections, result)
-        rings, points = self._rings(detections)
+        first, both = next(iter(self.trackers.values())), list[Outlines]()
+        for frame, places in zip(detections.frames, self._places(detections), strict=True):
+            both.append(constellations.rings_of(frame, places, detections.networks, first.target))
+        rings = both[0], both[1]
+        points = constellations.points_of(rings, first.cameras)
         results, others = dict(found), {name: list[Tracking]() for name in self.trackers}
         for least in (POINTS, POINTS - 1):
             claims = self._claims(detections.frames, rings, points, least)
@@ -113,27 +162,31 @@ class BodyTracker:
                 if name in results:
                     others[name].append(result)
                 else:
-                    results[name] = result
+                    results[name] = told[name] = result
                     _take(detections, result)
+            if least == POINTS:
+                yield
         for name, further in others.items():
             if name in results and results[name].found:
-                results[name] = self.trackers[name].nearest(results[name], [one for one in further if one.found])
-        missing = {name: tracker.find(detections) for name, tracker in self.trackers.items() if name not in results}
-        return results | _told(missing)
+                told[name] = self.trackers[name].nearest(results[name], [one for one in further if one.found])
+        missing = {}
+        for name, tracker in self.trackers.items():
+            if name not in results:
+                yield
+                missing[name] = yield from tracker.find_in_parts(detections)
+        told |= _told(missing)
 
-    def _rings(self, detections: Detections) -> tuple[tuple[Outlines, Outlines], Points]:
-        """All rings of both views, in windows in which circles are as large as usual, and the points where their rays meet."""
+    def _places(self, detections: Detections) -> list[NDArray]:
+        """Places : (n, 2) px of each view that may be circles' middles, in windows in which circles are as large as usual."""
         first = next(iter(self.trackers.values()))
         known = [tracker.disc_px for tracker in self.trackers.values() if tracker.disc_px is not None]
-        rings = []
+        places = []
         for k, camera in enumerate(first.cameras):
             windows = circle_detector.levels(camera.size)
             level = windows[circle_detector.usual_level(windows, min(known, default=None))]
             seen = detections.candidates([(k, window) for window in level], first.count)
-            places = np.concatenate([each.points for each in seen])
-            rings.append(constellations.rings_of(detections.frames[k], places, detections.networks, first.target))
-        both = rings[0], rings[1]
-        return both, constellations.points_of(both, first.cameras)
+            places.append(np.concatenate([each.points for each in seen]))
+        return places
 
     def _claims(
         self, frames: tuple[NDArray, NDArray], rings: tuple[Outlines, Outlines], points: Points, least: int
@@ -154,6 +207,11 @@ class BodyTracker:
                     taken = frozenset((k, ring) for k in (0, 1) for ring in points.rings[choice[choice >= 0], k].tolist())
                     claims.append(_Claim(name, result, taken))
         return claims
+
+
+def _beside(found: Mapping[str, Tracking], earlier: Mapping[str, Tracking]) -> dict[str, Tracking]:
+    """Results of bodies that are followed, with the further bodies of their design that an earlier pair showed."""
+    return {name: replace(one, others=earlier[name].others) for name, one in found.items() if name in earlier}
 
 
 def _settled(claims: Sequence[_Claim]) -> list[_Claim]:

@@ -5,7 +5,7 @@ fails the segmenter looks at those places, and then the detector at the whole fr
 of sizes against distances, and of both views against each other; so what is wrong is not found rather than found wrongly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, Uncertainty, in_use
 from recon.model.rig import Target
 from recon.tracking import circle_detector, circle_segmenter, covered_circle, identity, views
-from recon.tracking.circle_detector import Detections, Window
+from recon.tracking.circle_detector import AT_ONCE, Candidates, Detections, Window
 from recon.tracking.frames import grey
 from recon.tracking.identity import Naming
 from recon.tracking.networks import Networks
@@ -380,6 +380,15 @@ class Tracker:
 
     def find(self, detections: Detections) -> Tracking:
         """Search both frames, level by level of what the detector sees of them."""
+        parts = self.find_in_parts(detections)
+        while True:
+            try:
+                next(parts)
+            except StopIteration as end:
+                return end.value
+
+    def find_in_parts(self, detections: Detections) -> Generator[None, None, Tracking]:
+        """The same in parts of a few windows or a naming each, between which something else may be done."""
         levels = [circle_detector.levels(camera.size) for camera in self.cameras]
         usual = [circle_detector.usual_level(each, self.disc_px) for each in levels]
         result, shown = None, list[tuple[bool, int]]()
@@ -387,7 +396,7 @@ class Tracker:
             windows = [each[number] if number < len(each) else () for each in levels]
             if number and not self._at_any_size() and number not in usual:
                 continue
-            seen = self._detected_in(detections, windows)
+            seen = yield from self._detected_in(detections, windows)
             if isinstance(seen, Tracking):
                 return seen
             most = sorted(map(_shown, seen), reverse=True)
@@ -402,14 +411,19 @@ class Tracker:
         """Whether the target may be of any size: now and then, as a search for small circles takes its time."""
         return self._missed % ALL_LEVELS == (0 if self.disc_px is None else ALL_LEVELS - 1)
 
-    def _detected_in(self, detections: Detections, windows: Sequence[Sequence[Window]]) -> Tracking | Views:
+    def _detected_in(
+        self, detections: Detections, windows: Sequence[Sequence[Window]]
+    ) -> Generator[None, None, Tracking | Views]:
         """Search windows of both frames; verify each pose hypothesis (P3P) of one view in the other.
 
         Without a pose the views that show most of the target.
         """
         frames, networks = detections.frames, detections.networks
         places = [(k, window) for k, each in enumerate(windows) for window in each]
-        seen = detections.candidates(places, self.count)
+        seen: list[Candidates] = []
+        for first in range(0, len(places), AT_ONCE):
+            seen += detections.candidates(places[first : first + AT_ONCE], self.count)
+            yield
         choices = [
             (k, naming)
             for (k, window), candidates in zip(places, seen, strict=True)
@@ -431,6 +445,7 @@ class Tracker:
                 if any(result.found for result in results):
                     return _likeliest(results)
                 likeliest.update((1 - k, other) for other in others if other.found)
+            yield
         first, second = (likeliest.get(k, views.absent(count, self.count)) for k, count in enumerate(counts))
         return views.in_light(first, frames[0]), views.in_light(second, frames[1])
 

@@ -60,7 +60,7 @@ LOG, LIT = "log.jsonl", "lit.png"
 LOOK_S = 0.2  # between two looks whether all goes on
 WRITE_S = 0.5  # between two pictures that are written in place of a projector
 MOST_VISITORS = 4 * mentor_site.MOST_CLIENTS  # connections at once: a page asks for several things
-SEARCH_S = 1.0  # between searches for other bodies while the patient is followed: they take the time of some pictures
+SEARCH_S = 1.0  # between searches for further bodies while the patient is followed; each pair takes a part of one
 
 Mentor = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,40}$")]
 

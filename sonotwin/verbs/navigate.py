@@ -56,7 +56,7 @@ from sonotwin.live_sources import LiveFields, View, given_or_held
 from sonotwin.open_devices import Host, LiveDevices, open_scanner
 
 LOOK_S = 0.2  # between two looks whether all goes on
-SEARCH_S = 0.2  # between two searches for bodies that are lost, which take as long as several pairs
+SEARCH_S = 0.2  # between two searches for bodies that are lost; each pair takes a part of one
 PLAN_MM = 1.0, 1000.0  # least and most from a planned path's entry to its aim: others are in another unit
 
 

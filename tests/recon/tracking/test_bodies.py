@@ -8,7 +8,7 @@ from recon.geometry import rigid
 from recon.model import circle_layout
 from recon.model.rig import Rig
 from recon.tracking import constellations, networks
-from recon.tracking.bodies import WAITING, BodyTracker
+from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker, is_beside
 from sonotwin import choices
 from tests.recon.tracking import drawings
@@ -58,16 +58,17 @@ def frames(rig, cameras, places):
 
 
 class Counted:
-    """Networks that count how often they look at whole frames."""
+    """Networks that count how often they look at whole frames, and at patches."""
 
     def __init__(self, networks):
-        self.networks, self.detections = networks, 0
+        self.networks, self.detections, self.segmentations = networks, 0, 0
 
     def detect(self, images):
         self.detections += 1
         return self.networks.detect(images)
 
     def segment(self, patches):
+        self.segmentations += 1
         return self.networks.segment(patches)
 
 
@@ -145,18 +146,70 @@ def test_two_bodies_of_one_design_are_told_neither(rig, cameras, found_by, place
     assert found["probe"].found and not found["needle"].found
 
 
-def test_a_search_for_what_is_lost_waits_while_another_is_followed(rig, cameras, found_by, places):
+@pytest.fixture
+def needle_away(cameras, rig, places):
     bodies = [(places["probe"], rig.target), (places["patient"], rig.bodies["patient"])]
-    shown = pair(cameras, bodies, np.random.default_rng(7))
-    counted = Counted(found_by)
-    tracker = of(rig, cameras, counted, search_s=0.2)
-    looks = []
-    for k in range(20):
-        found = tracker.step(*shown, 0.5 + k / 60)
-        looks.append(counted.detections)
-        assert found["needle"].pose.reason == (WAITING if looks[-1:] == looks[-2:-1] else found["needle"].pose.reason)
-    searches = np.flatnonzero(np.diff(looks, prepend=0))
-    assert searches[0] == 0 and (np.diff(searches) >= 12).all() and len(searches) == 2  # each 0.2 s at 60 pairs a second
+    return pair(cameras, bodies, np.random.default_rng(7))
+
+
+def live(rig, cameras, found_by, places, *known):
+    """A tracker that searches in parts, with bodies that it knows at time 0."""
+    tracker = of(rig, cameras, found_by, search_s=0.2)
+    for name in known:
+        tracker.trackers[name].remember(places[name], 0.0)
+    return tracker
+
+
+def test_a_pair_takes_a_part_of_a_search_while_another_body_is_followed(rig, cameras, found_by, places):
+    """The first looks at all rings, each 0.2 s; the others at a naming each, of rings that no body has."""
+    other = circle_layout.with_lengths(rig.target, np.array([46.0, 20.0, 36.0]))
+    bodies = [(places["probe"], rig.target), (places["patient"], rig.bodies["patient"]), (places["needle"], other)]
+    shown, counted = pair(cameras, bodies, np.random.default_rng(7)), Counted(found_by)
+    tracker, looks = live(rig, cameras, counted, places, "probe", "patient"), []
+    for k in range(1, 40):
+        counted.detections = counted.segmentations = 0
+        found = tracker.step(*shown, k / 60)
+        assert found["probe"].how == found["patient"].how == "predicted" and not found["needle"].found
+        looks.append((counted.detections, counted.segmentations))
+    detections, segmentations = np.array(looks).T
+    begun = np.flatnonzero((detections > 0) & (segmentations > 0))
+    assert begun[0] == 0 and (np.diff(begun) >= 12).all() and len(begun) == 4  # each 0.2 s at 60 pairs a second
+    later = np.delete(segmentations, begun)
+    assert segmentations[begun].max() <= 6 and later.max() == 1  # three sizes of patches in both views, then a naming
+    counted.segmentations = 0
+    of(rig, cameras, counted).step(*shown, 1.0)
+    assert counted.segmentations > 2 * segmentations.max()
+
+
+def test_a_lost_body_in_whole_view_is_found_in_the_pair_of_the_search(rig, cameras, found_by, places, frames):
+    found = live(rig, cameras, found_by, places, "patient").step(*frames, 0.02)
+    assert [one.how for one in found.values()] == ["detected", "detected", "predicted"]
+    for name, one in found.items():
+        assert off_mm(one, places[name]) < 0.05
+
+
+def test_a_lost_body_seen_in_part_is_found_by_parts_of_a_search(rig, cameras, found_by, places, needle_away):
+    """Within half a second, as itself, while the patient is followed in each pair."""
+    left, right = needle_away
+    left = covered(left, cameras[0], places["probe"], rig.target, 1)
+    tracker = live(rig, cameras, found_by, places, "patient")
+    for k in range(1, 31):
+        found = tracker.step(left, right, k / 60)
+        assert found["patient"].how == "predicted" and not found["needle"].found
+        if found["probe"].found:
+            break
+    assert off_mm(found["probe"], places["probe"]) < 0.3
+
+
+def test_further_bodies_of_a_design_are_told_by_parts_of_a_search(rig, cameras, found_by, places):
+    """A second probe in the needle's place, while the probe and the patient are followed."""
+    bodies = [(places["probe"], rig.target), (places["needle"], rig.target), (places["patient"], rig.bodies["patient"])]
+    shown, tracker = pair(cameras, bodies, np.random.default_rng(5)), live(rig, cameras, found_by, places, "probe", "patient")
+    found = [tracker.step(*shown, k / 60) for k in range(1, 31)]
+    assert all(each["probe"].how == each["patient"].how == "predicted" for each in found)
+    told = [each["probe"].apart_mm for each in found if each["probe"].apart_mm is not None]
+    expected = np.linalg.norm(places["probe"][:3, 3] - places["needle"][:3, 3])
+    assert told and told == pytest.approx([expected] * len(told), abs=0.2)
 
 
 def test_rings_that_no_body_has_are_no_body(rig, cameras, found_by, places):
