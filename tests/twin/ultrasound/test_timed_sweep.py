@@ -117,3 +117,15 @@ def test_all_n_wires_stay_in_view(cylinders, clean):
     assert np.mean(inside) > 0.9
     with pytest.raises(InputError, match="expected a scene of N-wires, such as scene=n_wires, found no wires"):
         over_rows(RowPath(), cylinders, clean)
+
+
+def test_a_probe_that_keeps_moving_stays_over_the_wires(clean):
+    """Without rests it goes through the poses of one that rests, smoothly, and has a pose at any moment."""
+    wired = body(build_scene({"kind": "n_wires"}))
+    rests, middles = over_rows(RowPath(count=6), wired, clean)
+    course, none = over_rows(RowPath(count=6, rest_s=0, move_s=2.0), wired, clean)
+    assert len(none) == 0 and course.times[-1] == 10_000_000_000
+    through = tracks.at(course, np.arange(6) * 2_000_000_000)
+    assert through == pytest.approx(tracks.at(rests, middles), abs=1e-9)
+    steps = np.linalg.norm(np.diff(course.poses[:, :3, 3], axis=0), axis=1)
+    assert np.abs(np.diff(steps)).max() < 0.05 * steps.max() + 1e-3, "mm in 10 ms: no jerk"
