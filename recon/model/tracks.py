@@ -1,11 +1,11 @@
 """Poses over time: a tracker's poses of a moving body, and its pose at any moment between."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, PlainValidator
 from scipy.spatial.transform import Rotation, Slerp
 
 from recon import arguments
@@ -13,8 +13,20 @@ from recon.errors import InputError
 from recon.geometry import rigid
 
 Array = NDArray[np.float64]
-LagSeconds = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]  # s that images' time stamps are late; of a setting
+MOST_LAG_S = 1e6
+LagSeconds = Annotated[float, Field(ge=-MOST_LAG_S, le=MOST_LAG_S, allow_inf_nan=False)]  # s that stamps of images are late
 
+
+def _of_setting(value: Any) -> float | Literal["free"]:
+    """Seconds, or the word free."""
+    if value == "free":
+        return "free"
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MOST_LAG_S:
+        return float(value)
+    raise ValueError(f"expected free, or a number from -{MOST_LAG_S:g} to {MOST_LAG_S:g}, found {value}")
+
+
+FreeLagSeconds = Annotated[float | Literal["free"], PlainValidator(_of_setting)]  # the same, or one that is found
 MAX_GAP_S = 0.25  # between two poses, over which none is interpolated
 SAME_S = 0.5e-3  # a time that is rounded to ms: at it a pose holds, however far away the next is
 
@@ -166,9 +178,11 @@ def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
     return at(track, np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9)))
 
 
-def rates_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
-    """Change of these poses : (n, 4, 4) per s, by which a longer lag moves them back; zero where there is none."""
-    step_s = 0.005
+def rates_at(track: Track, times: NDArray[np.int64], lag_s: float, step_s: float = 0.005) -> Array:
+    """Change of these poses : (n, 4, 4) per s, by which a longer lag moves them back; zero where there is none.
+
+    step_s : before and after each moment, to the poses that it is measured by
+    """
     before, there, after = (poses_at(track, times, lag_s + step) for step in (step_s, 0.0, -step_s))
     rates = np.where(np.isfinite(before), there - before, after - there) / step_s
     both = np.isfinite(before) & np.isfinite(after)

@@ -36,7 +36,8 @@ from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.wire_phantom import WirePhantom
-from recon.probe_calibration import movement, probe_checks, wire_dots
+from recon.probe_calibration import lateness, movement, probe_checks, wire_dots
+from recon.probe_calibration.lateness import SURE, Lateness
 from recon.probe_calibration.movement import LEAST_FRAMES, LEAST_FREEDOM, PROBE, WIRES, Movement
 from recon.probe_calibration.point_calibration import MAX_FACTOR, MAX_RMS_MM, MIN_INLIERS, NAMED, SHIFT, Noise
 
@@ -59,11 +60,9 @@ HELD = 1e15  # information on unknowns that stay
 FAR_MM = 1e3  # 1 sigma of dots that are left out
 NEIGHBOURS = 4.0  # that count as one, from which on it is told
 ALIKE = 1.5  # squared residuals of arrangements beside the best, of which the registration chooses
-SURE = 5.0  # standard deviations from which on an unusual value is told
 CHANCE = float(chdtrc(1, SURE**2))  # of as much by noise: of a movement
 SAME_SIZE = 0.005  # of a phantom, and its definition
 MAX_SIZE = 0.03  # beyond which it is another phantom
-NO_LAG_S = 0.005  # lag that isn't worth a word
 MOST_COURSES = 40  # of a sudden movement, evenly over the frames
 LARGE = np.array([*np.radians(np.full(3, 5.0)), *np.full(3, 5.0)])  # rad and mm, 1 sigma of half a movement beforehand
 MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
@@ -306,18 +305,24 @@ def _covariances(estimate: _Estimate, problem: _Problem, inliers: Mask, level: f
     """
     frames, noise = problem.frames, problem.noise
     n, k = frames.pixels.shape[:2]
-    pose = noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
     planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T  # (k, 2, 3), of the world
-    by_pose = (planes @ rigid.slopes(estimate.arms(frames))).reshape(n, 2 * k, 6)
     local = np.zeros((n, k, 3, 3))
     local[..., :2, :2] = frames.pixel_covariance * np.outer(estimate.scale, estimate.scale)
     local[..., 2, 2] = noise.slice_mm**2
     by_dot = planes @ (frames.poses[:, None, :3, :3] @ estimate.target_from_image[:3, :3])
     own = level**2 * propagate(by_dot, local) + np.where(inliers, FLOOR_MM, FAR_MM)[..., None, None] ** 2 * np.eye(2)
-    whole = max(level, 1.0) ** 2 * propagate(by_pose, pose)
+    whole = max(level, 1.0) ** 2 * _of_poses(estimate, problem)
     for each in range(k):
         whole[:, 2 * each : 2 * each + 2, 2 * each : 2 * each + 2] += own[:, each]
     return whole
+
+
+def _of_poses(estimate: _Estimate, problem: _Problem) -> Array:
+    """The poses' part of these covariances : (n, 2 k, 2 k) mm^2, where their noise is as assumed."""
+    frames = problem.frames
+    pose = problem.noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
+    planes = problem.phantom.normals @ estimate.world_from_phantom[:3, :3].T
+    return propagate((planes @ rigid.slopes(estimate.arms(frames))).reshape(len(frames.poses), -1, 6), pose)
 
 
 def _slopes(estimate: _Estimate, problem: _Problem) -> Array:
@@ -412,7 +417,7 @@ class LineAdjustment:
     chi: Array  # (n, k) length of a residual over its standard deviation; sqrt(2) for a typical dot
     noise_factor: float  # measured noise over the assumed
     size: tuple[float, float]  # of the phantom beside its definition, by the poses; its standard deviation
-    more_lag_s: tuple[float, float]  # of the B-scans, beyond that of the poses, and its standard deviation; NaN if unknown
+    late: Lateness | None  # of the B-scans, beyond the lag of the poses; None without times
     held_out_mm: float  # RMS of dots of half of the frames, by the other half
     earlier_held_out_mm: float = np.nan  # the same by an earlier calibration; NaN without one
     moved: Movement | None = None  # of the probe or the phantom, which the covariance allows for
@@ -464,8 +469,8 @@ class LineAdjustment:
             yield f"by the poses the phantom is {100 * (size - 1):+.1f} ± {100 * sigma:.1f} % larger than its definition"
         if self.moved is not None:
             yield _described(self.moved)
-        if _is_late(self.more_lag_s):
-            yield _described_lag(self.more_lag_s)
+        if self.late is not None and self.late.shown:
+            yield self.late.described
         elif self.persistence > NEIGHBOURS:
             cause = "poses err from place to place, or something moves slowly"
             yield f"{self.persistence:.0f} neighbouring frames count as one, since their residuals are alike: {cause}"
@@ -474,18 +479,6 @@ class LineAdjustment:
 def _used(inliers: Mask) -> Mask:
     """Frames : (n,) of which most dots are inliers : (n, k)."""
     return inliers.mean(axis=1) > 0.5
-
-
-def _is_late(more_lag_s: tuple[float, float]) -> bool:
-    """Whether a lag is worth a word, by its standard deviation."""
-    lag, sigma = more_lag_s
-    return abs(lag) > max(SURE * sigma, NO_LAG_S)
-
-
-def _described_lag(more_lag_s: tuple[float, float]) -> str:
-    lag, sigma = more_lag_s
-    off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
-    return f"the B-scans are {off} beyond lag_s: add {lag:+.3f} to it, or hold still"
 
 
 def _described(moved: Movement) -> str:
@@ -548,23 +541,24 @@ def calibrate(
     if wires.registration is None:
         probe_checks.motion(*several, size)
     solved = _solve(problem, found)
-    sizes, lag = _size(problem, solved), _more_lag(problem, found, solved)
+    sizes, late = _size(problem, solved), _lateness(problem, found, solved)
     if abs(sizes[0] - 1) > max(SURE * sizes[1], MAX_SIZE):
         raise InputError(
             f"wires: expected a phantom of the size that the probe's motion asks for, found it {100 * (sizes[0] - 1):+.1f} ± "
             f"{100 * sizes[1]:.1f} % larger: another phantom than defined, or poses of another unit or scale"
         )
-    named = None if _is_late(lag) else _movement(solved, _used(found.inliers))
+    is_late = late is not None and late.shown
+    named = None if is_late else _movement(solved, _used(found.inliers))
     count = persistence(solved.left) if named is None else named.persistence
     estimate, by_lag = found.estimate, np.zeros(len(NAMES))
-    if sightings.lag_sigma_s and problem.frames.pose_rates is not None:
-        by_lag = _further(solved, _lag_columns(problem, found, solved))[0][: len(NAMES), 0] * sightings.lag_sigma_s
+    if sightings.lag_sigma_s and late is not None:
+        by_lag = sightings.lag_sigma_s * late.change
     try:
         frames, own = _Placed(*several), _covariance(solved, 1.0) + np.outer(by_lag, by_lag)
         probe_checks.certainty(estimate.target_from_image, estimate.scale, own, frames, size, max_sigma_mm)
     except InputError as error:
-        late = "the uncertainty of the lag is in it: hold still, or measure the lag" if sightings.lag_sigma_s else ""
-        also = _described_lag(lag) if _is_late(lag) else late
+        unsure = "the uncertainty of the lag is in it: hold still, or measure the lag" if sightings.lag_sigma_s else ""
+        also = late.described if late is not None and late.shown else unsure
         raise InputError(f"{error}; {also}" if also else str(error)) from None
     covariance = _covariance(solved, count) + np.outer(by_lag, by_lag)
     if named is not None:
@@ -584,12 +578,20 @@ def calibrate(
         np.sqrt(_squared(estimate, problem, found.level)),
         found.level,
         sizes,
-        lag,
+        late,
         _held_out(problem, found, found.estimate),
         np.nan if earlier is None else _held_out_by(problem, found, earlier),
         None if named is None else named.movement,
         count,
     )
+
+
+def misfit(sightings: DotSightings, wires: Wires, noise: Noise) -> float:
+    """Mean square distance, mm^2, of the dots from their wires, each counted up to MAX_RMS_MM; infinite for few frames."""
+    if len(sightings.poses) < MIN_FRAMES:
+        return np.inf
+    problem, start = _arranged(sightings, wires, noise, np.random.default_rng(0), DRAWS_TRIED, refined=1)
+    return float(np.minimum((_residuals(start, problem) ** 2).sum(axis=-1), MAX_RMS_MM**2).mean())
 
 
 @dataclass(frozen=True)
@@ -600,7 +602,14 @@ class _Placed:
     pixels: Array  # (m, 2)
 
 
-def _arranged(sightings: DotSightings, wires: Wires, noise: Noise, rng: np.random.Generator) -> tuple[_Problem, _Estimate]:
+def _arranged(
+    sightings: DotSightings,
+    wires: Wires,
+    noise: Noise,
+    rng: np.random.Generator,
+    draws: int = DRAWS,
+    refined: int = REFINED,
+) -> tuple[_Problem, _Estimate]:
     """Choose an arrangement of each frame's dots, and an estimate that it agrees with.
 
     Arrangements are of four classes: rows seen left to right or right to left, and upright or upside down. How the probe was
@@ -624,7 +633,7 @@ def _arranged(sightings: DotSightings, wires: Wires, noise: Noise, rng: np.rando
         if len(numbers) >= MIN_FRAMES:
             trials.append(problem_of(of_class[numbers].argmax(axis=1), numbers))
     trials = trials or [problem_of(0 * everywhere)]
-    starts = [_robust_start(each, rng) for each in trials]
+    starts = [_robust_start(each, rng, draws, refined) for each in trials]
     medians = [_median(start, each) for start, each in zip(starts, trials, strict=True)]
     likely = [k for k, median in enumerate(medians) if median <= ALIKE * min(medians)]
     known = trials[0].known
@@ -711,11 +720,15 @@ def _lag_columns(problem: _Problem, found: _Fit, solved: _Solved) -> Array:
     return solved.whiten @ -np.einsum("kij,nkj->nki", planes, motion).reshape(*solved.left.shape, 1)
 
 
-def _more_lag(problem: _Problem, found: _Fit, solved: _Solved) -> tuple[float, float]:
-    """Lag of the B-scans that the residuals show, s, and its standard deviation; NaN without times, or at rest."""
-    if problem.frames.pose_rates is None or not np.abs(problem.frames.pose_rates).any():
-        return np.nan, np.nan
-    return _with_sigma(solved, _lag_columns(problem, found, solved))
+def _lateness(problem: _Problem, found: _Fit, solved: _Solved) -> Lateness | None:
+    """Lag of the B-scans that the residuals show; None without times."""
+    if problem.frames.pose_rates is None:
+        return None
+    column = _lag_columns(problem, found, solved)[..., 0]
+    counted, level = 2 * found.inliers.sum(axis=1), max(found.level, 1.0)
+    of_poses = level**2 * propagate(solved.whiten, _of_poses(found.estimate, problem))
+    by_poses = float(np.trace(of_poses, axis1=1, axis2=2).sum())
+    return lateness.of_residuals(column, solved.left, solved.slopes, solved.known, counted, level, by_poses)
 
 
 def _movement(solved: _Solved, used: Mask) -> _Named | None:

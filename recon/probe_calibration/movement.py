@@ -7,6 +7,8 @@ size: six numbers of the bracket, three of the wires.
 `find` names one. Squared residuals that fall by more with it than by noise, as F has it, show a movement; of two that may be,
 Schwarz's criterion chooses.
 
+Frames count as fewer where the residuals that a movement leaves are alike in neighbours.
+
 `average` takes what may have moved into parameters and covariance, as a movement that isn't shown can't be excluded either.
 Nothing moved, the probe did, or the wires did, evenly or all at once after any frame. Half of a movement is normal, with its size
 as standard deviation. Size and noise aren't known: each course and size is weighed by its evidence, which is the likelihood
@@ -25,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from recon.estimation.covariance import inverse
+from recon.estimation.covariance import inverse, root
+from recon.estimation.persistence import persistence
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -76,6 +79,7 @@ class Movement:
     log_chance: float  # of so much less residuals by noise alone, in any of the trials
     evidence: float  # logarithm of the likelihood, less Schwarz's penalty
     frames: Mask  # (n,) that it was estimated from
+    alike: float = 1.0  # frames that count as one, by what residuals it leaves
 
     @property
     def described(self) -> str:
@@ -162,22 +166,26 @@ def _fit(equations: FrameEquations, what: str, course: Course, used: Mask, trial
     moving = (course.growth[frames][:, None, None] * slopes[:, :, which]).reshape(len(left), -1)
     more = moving.shape[1]
     unknowns = slopes.shape[2] + more
-    freedom = len(left) - unknowns
-    if freedom < LEAST_FREEDOM:
+    if len(left) - unknowns < LEAST_FREEDOM:
         return None
     moving -= course.spanned @ (course.spanned.T @ moving)  # what the parameters don't explain of it
     solution = np.linalg.lstsq(moving, left)[0]
     rest = left - moving @ solution
     if not _explained(rest, frames & ~used, frames):
         return None
+    alike = persistence(rest.reshape(-1, 3))
+    freedom = (len(left) - unknowns) / alike
+    if freedom < LEAST_FREEDOM:
+        return None
     before, after = float(left @ left), float(rest @ rest)
-    chance = fdtrc(more, freedom, max(before - after, 0) / more / (after / freedom))
+    chance = fdtrc(more, freedom, max(before - after, 0) / alike / more / (after / alike / freedom))
     return Movement(
         what,
         growth=-solution,
         log_chance=float(np.log(trials) + np.log(np.maximum(chance, np.finfo(float).tiny))),
         evidence=-(len(left) * np.log(after) + unknowns * np.log(len(left))) / 2,
         frames=frames,
+        alike=alike,
     )
 
 
@@ -188,18 +196,24 @@ def _explained(left: Array, doubtful: Mask, frames: Mask) -> bool:
     return not before.any() or bool(np.mean(lengths[before] < USUAL * np.median(lengths[~before])) > 1 - LOST / 2)
 
 
+def alike(slopes: Array, left: Array, known: Array) -> float:
+    """Frames that count as one, as neighbours pull the parameters alike; arguments as fields of `FrameEquations`.
+
+    Errors that are alike in neighbours do no harm where the probe is turned so far between them that they pull to other sides.
+    """
+    flat = slopes.reshape(-1, slopes.shape[2])
+    pulls = np.einsum("nij,ni->nj", slopes, left)
+    return persistence(pulls @ root(inverse(flat.T @ flat + np.diag(known))))
+
+
 class Rigid(NamedTuple):
-    """Least squares of k residuals of frames without a movement."""
+    """Least squares of k residuals of frames without a movement, each divided by the root of the frames that count as one."""
 
     slopes: Array  # (k, g)
     left: Array  # (k,) residuals after the step
     step: Array  # (g,) of the parameters
     spread: Array  # (g, g) covariance by noise of variance 1
-
-    @property
-    def freedom(self) -> int:
-        """Residuals beyond the unknowns."""
-        return len(self.left) - len(self.step)
+    freedom: float  # residuals beyond the unknowns, of frames that count
 
 
 class Outcomes(NamedTuple):
@@ -210,7 +224,7 @@ class Outcomes(NamedTuple):
     covariances: Array  # (s, g, g), with the movement of the probe
 
 
-def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 1.0) -> tuple[Array, Array]:
+def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 1.0, alike: float = 1.0) -> tuple[Array, Array]:
     """Parameters and their covariance over all movements.
 
     Parameters
@@ -221,6 +235,8 @@ def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 
         Frames to adjust: these, and others that are as right if something moved.
     noise : float
         Standard deviation of the equations' residuals, roughly, by which sizes in mm and deg become those in units of it.
+    alike : float
+        Frames that count as one.
 
     Returns
     -------
@@ -229,7 +245,7 @@ def average(equations: FrameEquations, used: Mask, frames: Mask, noise: float = 
     covariance : (g, g)
         Of either end, so with the movement of the probe.
     """
-    rigid = _rigid(equations, used, frames)
+    rigid = _rigid(equations, used, frames, alike)
     probe, wires = (np.zeros((len(rigid.step), size)) for size in (6, 3))
     probe[equations.by_probe], wires[equations.by_wires] = PROPORTIONS, np.eye(3)
     still = _outcomes(rigid, rigid.slopes @ probe, probe, np.zeros(1), STILL)
@@ -255,13 +271,14 @@ def _likely_courses(frames: Mask) -> Iterator[tuple[Array, float]]:
         yield np.where(number >= first, 1.0, -1.0), (1 - EVEN) / (len(number) - 1)
 
 
-def _rigid(equations: FrameEquations, used: Mask, frames: Mask) -> Rigid:
+def _rigid(equations: FrameEquations, used: Mask, frames: Mask, alike: float) -> Rigid:
     """Of some frames; those used have no slope left, as the equations are at their solution."""
     g, added = equations.slopes.shape[2], frames & ~used
-    slopes, left = equations.slopes[frames].reshape(-1, g), equations.residuals[frames].ravel()
+    slopes, left = (each[frames] / np.sqrt(alike) for each in (equations.slopes.reshape(len(frames), -1), equations.residuals))
+    slopes, left = slopes.reshape(-1, g), left.ravel()
     spread = inverse(slopes.T @ slopes + np.diag(equations.known))
-    step = -spread @ equations.slopes[added].reshape(-1, g).T @ equations.residuals[added].ravel()
-    return Rigid(slopes, left + slopes @ step, step, spread)
+    step = -spread @ equations.slopes[added].reshape(-1, g).T @ equations.residuals[added].ravel() / alike
+    return Rigid(slopes, left + slopes @ step, step, spread, (len(left) - g) / alike)
 
 
 def _outcomes(rigid: Rigid, moving: Array, at_ends: Array, sizes: Array, chance: float) -> Outcomes:
@@ -280,7 +297,7 @@ def _outcomes(rigid: Rigid, moving: Array, at_ends: Array, sizes: Array, chance:
     along = -axes.T @ moving.T @ rigid.left
     ratio = sizes[:, None] ** 2 / (1 + sizes[:, None] ** 2 * shown)  # (s, m) of the movement's variance to the noise's
     rest = np.maximum(rigid.left @ rigid.left - ratio @ along**2, NO_NOISE)
-    noise = (rest / (rigid.freedom - 2))[:, None, None]  # variance of Student's t
+    noise = (rest / max(rigid.freedom - 2, 1.0))[:, None, None]  # variance of Student's t
     growth, spread = (ratio * along) @ axes.T, noise * (axes * ratio[:, None]) @ axes.T
     squared = spread + growth[:, :, None] * growth[:, None]
     covariances = noise * rigid.spread + pull @ spread @ pull.T + at_ends @ squared @ at_ends.T

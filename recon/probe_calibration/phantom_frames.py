@@ -134,15 +134,34 @@ def look(
     known : of the phantom, by this module's `read`.
     """
     kind = registry.kind(PHANTOMS, phantom)
+    seen = tuple(kind.find(image, appearance, known).shifted(corner) for image in images)
+    frames = PhantomFrames(name, size, None, numbers, seen, corner[1], phantom, known)
+    return at_poses(frames, poses, pose_covariance, pose_rates, lag_sigma_s)
+
+
+def at_poses(
+    frames: PhantomFrames,
+    poses: Array,
+    pose_covariance: Array | None = None,
+    pose_rates: Array | None = None,
+    lag_sigma_s: float = 0.0,
+) -> PhantomFrames:
+    """The same n frames at other poses, as those of another lag; arguments as of `look`."""
     tracked = np.isfinite(poses).all(axis=(1, 2))
-    found = [kind.find(image, appearance, known).shifted(corner) for image in images]
+    found = [replace(each, reason=None) if each.reason == NO_POSE else each for each in frames.seen]
     seen = tuple(
         each if there else replace(each, reason=each.reason or NO_POSE) for each, there in zip(found, tracked, strict=True)
     )
     usable = np.flatnonzero([each.found for each in seen])
     covariance, rates = (None if each is None else each[usable] for each in (pose_covariance, pose_rates))
+    kind = registry.kind(PHANTOMS, frames.phantom)
     sightings = kind.sight([seen[k] for k in usable], poses[usable], covariance, rates, lag_sigma_s)
-    return PhantomFrames(name, size, sightings, numbers, seen, corner[1], phantom, known)
+    return replace(frames, sightings=sightings, seen=seen)
+
+
+def some(frames: PhantomFrames, chosen: NDArray[np.intp]) -> PhantomFrames:
+    """Some of the frames, by number from 0 on, before they are put at poses."""
+    return replace(frames, sightings=None, numbers=frames.numbers[chosen], seen=tuple(frames.seen[k] for k in chosen))
 
 
 def of_pairs(name: str, size: Size, poses: Array, pixels: Array) -> PhantomFrames:

@@ -39,8 +39,9 @@ from recon.estimation.parameters import Blocks
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
-from recon.probe_calibration import cross_wire, movement, probe_checks, wires
+from recon.probe_calibration import cross_wire, lateness, movement, probe_checks, wires
 from recon.probe_calibration.cross_wire import Appearance, Crossing
+from recon.probe_calibration.lateness import Lateness
 from recon.probe_calibration.movement import FrameEquations, Movement
 
 Array = NDArray[np.float64]
@@ -52,7 +53,9 @@ SHIFT = slice(5, 8)  # of NAMES
 NO_POSE = "the target was not tracked"
 MIN_FRAMES = 6
 DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
+REFINED = 5  # of these starts, the best
 GATE = 16.27  # squared normalised residual of an outlier; exceeded by 1 of 1000 good frames (chi-square, 3)
+DRAWS_TRIED = 50  # of these, where many lags are tried
 MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
 MAX_FACTOR = 8.0  # measured over assumed noise, of frames of one point at rest
 MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423 in each coordinate
@@ -91,6 +94,7 @@ class Sightings:
     slice_mm: Array | None = None  # (n,) standard deviation across the image plane
     directions: Array | None = None  # (n, 2, 2) px, along the wires' lines; NaN for a spot
     pose_by_lag: Array | None = None  # (n, 4, 4) change of the poses by one standard deviation of the B-scans' lag
+    pose_rates: Array | None = None  # (n, 4, 4) change of the poses a second, by which a lag of the B-scans moves them back
     beside: Array | None = None  # (n, 2) px a mm: shift of the lines' meeting point by the wires' distance; set by `calibrate`
 
     def of(self, chosen: ArrayLike) -> "Sightings":
@@ -113,6 +117,8 @@ class Adjustment:
     moved: Movement | None = None  # what moved while the frames were taken; the values are those of the middle
     by_lag: Array | None = None  # (8,) change of the calibration by one standard deviation of the lag, if the lag has one
     wire_covariance: Array | None = None  # (3, 3) mm^2, of the wire; None without an adjustment
+    late: Lateness | None = None  # of the B-scans, beyond the lag of the poses; None without times
+    persistence: float = 1.0  # frames that count as one in the covariance, as residuals of neighbours are alike
 
     @property
     def rms_mm(self) -> float:
@@ -234,19 +240,22 @@ def calibrate(
     equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
-    step, covariance = movement.average(equations, solved, inliers, factor)
+    alike = movement.alike(slopes[inliers][..., :used], left[inliers], equations.known) if moved is None else moved.alike
+    step, covariance = movement.average(equations, solved, inliers, factor, alike)
     estimate = estimate.moved(Step(np.pad(step, (0, len(UNKNOWNS) - used)), np.zeros((0, 0))))
     _check_motion(sightings.of(inliers), size, point_sigma_mm)
     of_wire, covariance = covariance[UNKNOWNS["wire"], UNKNOWNS["wire"]], covariance[: len(NAMES), : len(NAMES)].copy()
     by_lag = None if sightings.pose_by_lag is None else _by_lag(estimate, sightings, noise, inliers)
+    late = None if sightings.pose_rates is None else _lateness(estimate, sightings.of(inliers), noise, factor)
     if by_lag is not None:
         covariance += np.outer(by_lag, by_lag)
     try:
         place = estimate.target_from_image, estimate.scale
         probe_checks.certainty(*place, covariance, sightings.of(inliers), size, max_sigma_mm)
     except InputError as error:
-        late = "" if sightings.pose_by_lag is None else "; the uncertainty of the lag is in it: hold still, or measure the lag"
-        raise InputError(f"{error}{late}" if moved is None else f"{error}; {moved.described}") from None
+        unsure = "" if sightings.pose_by_lag is None else "; the uncertainty of the lag is in it: hold still, or measure the lag"
+        also = f"; {late.described}" if late is not None and late.shown else unsure
+        raise InputError(f"{error}{also}" if moved is None else f"{error}; {moved.described}") from None
     covariance[SHIFT, SHIFT] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])
@@ -254,7 +263,16 @@ def calibrate(
     probe_checks.outcome(calibration, size, expected)
     chi = np.sqrt(_squared(estimate, sightings, noise)) / factor
     left = _residuals(estimate, sightings)
-    return Adjustment(calibration, estimate.wire, left, chi, ~inliers, factor, abs(estimate.apart), moved, by_lag, of_wire)
+    apart = abs(estimate.apart)
+    return Adjustment(calibration, estimate.wire, left, chi, ~inliers, factor, apart, moved, by_lag, of_wire, late, alike)
+
+
+def misfit(sightings: Sightings, noise: Noise) -> float:
+    """Mean square distance, mm^2, of the point from one place, of which each counts up to MAX_RMS_MM; infinite for few frames."""
+    if len(sightings.pixels) < MIN_FRAMES:
+        return np.inf
+    start = _robust_start(sightings, noise, np.random.default_rng(0), None, DRAWS_TRIED, refined=1)
+    return float(np.minimum((_residuals(start, sightings) ** 2).sum(axis=1), MAX_RMS_MM**2).mean())
 
 
 def held_out_mm(
@@ -435,14 +453,18 @@ def _residuals(estimate: _Estimate, sightings: Sightings) -> Array:
 def _covariances(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
     """Of the residuals : (n, 3, 3) mm^2: the pose's, with its lever, and in the image's axes the crossing's."""
     n = len(sightings.pixels)
-    pose = noise.of_pose if sightings.pose_covariance is None else sightings.pose_covariance
-    lever = rigid.slopes(estimate.arms(sightings))
     local = np.broadcast_to(FLOOR_MM**2 * np.eye(3), (n, 3, 3)).copy()
     pixel = np.eye(2) * noise.pixel_px**2 if sightings.pixel_covariance is None else sightings.pixel_covariance
     local[:, :2, :2] += pixel * np.outer(estimate.scale, estimate.scale)
     local[:, 2, 2] += (noise.slice_mm if sightings.slice_mm is None else sightings.slice_mm) ** 2
     world_from_image = sightings.poses[:, :3, :3] @ estimate.target_from_image[:3, :3]
-    return propagate(lever, pose) + propagate(world_from_image, local)
+    return _of_poses(estimate, sightings, noise) + propagate(world_from_image, local)
+
+
+def _of_poses(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
+    """The poses' part of these covariances : (n, 3, 3) mm^2."""
+    pose = noise.of_pose if sightings.pose_covariance is None else sightings.pose_covariance
+    return propagate(rigid.slopes(estimate.arms(sightings)), pose)
 
 
 def _squared(estimate: _Estimate, sightings: Sightings, noise: Noise) -> Array:
@@ -482,15 +504,22 @@ def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | 
     return descend(start, lambda estimate: _normal_equations(estimate, sightings, noise, weights), _Estimate.moved).estimate
 
 
-def _robust_start(sightings: Sightings, noise: Noise, rng: np.random.Generator, point_sigma_mm: Array | None = None) -> _Estimate:
+def _robust_start(
+    sightings: Sightings,
+    noise: Noise,
+    rng: np.random.Generator,
+    point_sigma_mm: Array | None = None,
+    count: int = DRAWS,
+    refined: int = REFINED,
+) -> _Estimate:
     """Least median of squares over closed forms: of all frames, and of random sixes. The best few are refined first."""
     n = len(sightings.pixels)
-    draws = np.argsort(rng.random((DRAWS, n)), axis=1)[:, :MIN_FRAMES]
+    draws = np.argsort(rng.random((count, n)), axis=1)[:, :MIN_FRAMES]
     solve, sigma = (closed_form, FREE) if point_sigma_mm is None else (closed_form_of_known, point_sigma_mm)
     whole = [each[None] for each in solve(sightings.poses, sightings.pixels)]
     drawn = solve(sightings.poses[draws], sightings.pixels[draws])
     starts = [np.concatenate(pair) for pair in zip(whole, drawn, strict=True)]
-    order = np.argsort(_medians(starts, sightings))[:5]
+    order = np.argsort(_medians(starts, sightings))[:refined]
     best = [_refined_on_half(_Estimate(*(each[k] for each in starts), wire_sigma=sigma), sightings, noise) for k in order]
     return min(best, key=lambda estimate: np.median(_squared(estimate, sightings, noise)))
 
@@ -535,14 +564,29 @@ def _without_outliers(start: _Estimate, sightings: Sightings, noise: Noise) -> t
     return estimate, inliers, float(factor)
 
 
+def _motions(estimate: _Estimate, sightings: Sightings, moved: Array) -> Array:
+    """Shifts : (n, 3) mm of the places by changes : (n, 4, 4) of the poses."""
+    return np.einsum("nij,nj->ni", moved[:, :3, :3], estimate.points(sightings)) + moved[:, :3, 3]
+
+
+def _lateness(estimate: _Estimate, sightings: Sightings, noise: Noise, factor: float) -> Lateness:
+    """Lag of the B-scans that the residuals of frames that aren't outliers show; a factor of noise over the assumed."""
+    assert sightings.pose_rates is not None
+    slopes, left = (each / factor for each in _whitened(estimate, sightings, noise))
+    whiten = whitening(_covariances(estimate, sightings, noise))
+    motion = (whiten @ _motions(estimate, sightings, sightings.pose_rates)[..., None])[..., 0] / factor
+    by_poses = float(np.trace(propagate(whiten, _of_poses(estimate, sightings, noise)), axis1=1, axis2=2).sum())
+    counted = np.full(len(left), left.shape[1])
+    return lateness.of_residuals(-motion, left, slopes, estimate.known / factor**2, counted, factor, by_poses)
+
+
 def _by_lag(estimate: _Estimate, sightings: Sightings, noise: Noise, used: Mask) -> Array:
     """Change of the calibration : (8,) by one standard deviation of the lag, which moves all poses along their motions."""
     assert sightings.pose_by_lag is not None
     moved = sightings.pose_by_lag[used]
     there = sightings.of(used)
-    shifts = np.einsum("nij,nj->ni", moved[:, :3, :3], estimate.points(there)) + moved[:, :3, 3]
     slopes = _whitened(estimate, there, noise)[0]
-    left = whitening(_covariances(estimate, there, noise)) @ shifts[..., None]
+    left = whitening(_covariances(estimate, there, noise)) @ _motions(estimate, there, moved)[..., None]
     information = np.einsum("nij,nik->jk", slopes, slopes) + np.diag(estimate.known)
     return -np.linalg.solve(information, np.einsum("nij,nik->j", slopes, left))[: len(NAMES)]
 

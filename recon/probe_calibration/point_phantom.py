@@ -15,7 +15,7 @@ from recon.probe_calibration.tank_calibration import Settings
 
 Array = NDArray[np.float64]
 
-__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "read", "sight"]
+__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "misfit", "read", "sight"]
 SHOWS = "crossing"
 _SCANNER = "another scanner? give appearance."
 WAYS = {
@@ -36,7 +36,13 @@ def read(settings: Settings, reference: str | None) -> None:
 def sight(seen: Sequence[Crossing], poses: Array, covariance: Array | None, rates: Array | None, lag_sigma_s: float) -> Sightings:
     """The point in n frames."""
     by_lag = lag_sigma_s * rates if lag_sigma_s and rates is not None else None
-    return replace(point_calibration.of_crossings(seen, poses), pose_covariance=covariance, pose_by_lag=by_lag)
+    seen_there = point_calibration.of_crossings(seen, poses)
+    return replace(seen_there, pose_covariance=covariance, pose_by_lag=by_lag, pose_rates=rates)
+
+
+def misfit(frames: PhantomFrames, settings: Settings) -> float:
+    """Mean square distance of the point from one place, as `point_calibration.misfit`."""
+    return point_calibration.misfit(frames.sightings, settings.noise)
 
 
 def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> Adjustment:
@@ -55,8 +61,13 @@ def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> Adj
 
 
 def figures(found: Adjustment) -> Metrics:
-    """The distance of the wires' axes."""
-    return {"wires_apart_mm": found.apart_mm}
+    """The distance of the wires' axes, and what may be mistaken."""
+    return {
+        "wires_apart_mm": found.apart_mm,
+        "frames_that_count_as_one": found.persistence,
+        "more_lag_s": np.nan if found.late is None else found.late.seconds,
+        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
+    }
 
 
 def describe(found: Adjustment, settings: Settings) -> Iterator[str]:
@@ -64,5 +75,7 @@ def describe(found: Adjustment, settings: Settings) -> Iterator[str]:
     if found.apart_mm:
         ahead = f"their echo taken {settings.echo_ahead_mm:.2f} mm before their axes"
         yield f"wires       seen as lines, the axes {found.apart_mm:.2f} mm apart; {ahead}"
+    if found.late is not None and found.late.shown:
+        yield f"warning     {found.late.described}"
     if found.moved is not None:
         yield f"warning     {found.moved.described}"

@@ -53,7 +53,8 @@ def arrays(sightings: _Sightings) -> dict[str, Array]:
     """The fields that are given, as float arrays; refuses all that are no numbers of n frames, and covariances that are none."""
     count = len(arguments.numbers("sightings: poses", sightings.poses, ("n", 4, 4), finite=False))
     needed, unseen = {"poses": (4, 4), "pixels": (2,)}, {"directions": (2, 2)}  # poses and pixels have checks of their own
-    covariances, others = {"pose_covariance": (6, 6), "pixel_covariance": (2, 2)}, {"slice_mm": (), "pose_by_lag": (4, 4)}
+    covariances = {"pose_covariance": (6, 6), "pixel_covariance": (2, 2)}
+    others = {"slice_mm": (), "pose_by_lag": (4, 4), "pose_rates": (4, 4)}
     found = {}
     for name, shape in (needed | unseen | covariances | others).items():
         value = getattr(sightings, name)

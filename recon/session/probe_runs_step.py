@@ -128,7 +128,7 @@ def read_runs(settings: Settings, usual: Probe, watch: Watch = SILENT) -> Iterat
         name = name_of(path, sweep)
         if (path / MANIFEST).is_file():
             opened = sweep_part.read_sweep(path, sweep, "probe", settings.implausible)
-            lag = settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma
+            lag = settings.taken_lag_s, settings.clip, watch, settings.lag_sigma
             frames = replace(probe_step.look(opened, settings, *lag), name=name)
         elif path.suffix.lower() == ".csv":
             frames = phantom_frames.of_pairs(name, design.image_size, *sweep_tables.read_pairs(path))

@@ -4,13 +4,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import Annotated, Final
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import model_validator
 
 from recon import registry
-from recon.capture import probe_files, sweep_tables
+from recon.capture import lag_files, probe_files, sweep_tables
+from recon.capture.lag_files import LagFile
 from recon.capture.sweep_part import SweepCapture
+from recon.errors import InputError
 from recon.files import atomic, metrics
 from recon.files.metrics import Metrics
 from recon.freehand import sequence_sweep
@@ -20,9 +24,12 @@ from recon.freehand.sequences import FrameNames
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model import tracks
 from recon.model.rig import NotNegative, Probe, Rig
-from recon.model.tracks import LagSeconds
-from recon.probe_calibration import phantom_frames, probe_figures, sound_in_water, tank_calibration
-from recon.probe_calibration.phantom_frames import PHANTOMS, PhantomFrames
+from recon.model.tracks import FreeLagSeconds
+from recon.probe_calibration import free_lag, latency, lateness, phantom_frames, probe_figures, sound_in_water, tank_calibration
+from recon.probe_calibration.free_lag import FreeLag
+from recon.probe_calibration.lateness import Lateness
+from recon.probe_calibration.phantom_frames import NO_POSE, PHANTOMS, PhantomFrames
+from recon.probe_calibration.point_calibration import Noise
 from recon.probe_calibration.tank_calibration import Result
 from recon.registry import Choice
 from recon.session.settings import ScaleFields
@@ -31,6 +38,10 @@ from recon.session.watch import SILENT, Watch
 BY = "calibrate-probe"  # who writes
 PROBE = "probe.yaml"
 FRAMES = "frames.csv"
+FREE: Final = "free"  # lag_s that is found
+
+Array = NDArray[np.float64]
+Sweep = SweepCapture | SequenceSweep
 
 
 class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
@@ -53,8 +64,9 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
     clip: Rectangle | None = None
     """[u, v, width, height] px, the part of each B-scan that is looked at, of an uncropped screen; null is all of it. The
     calibration holds for the whole images all the same"""
-    lag_s: LagSeconds | None = None
-    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`; null takes none, of a capture to 0.1 s"""
+    lag_s: FreeLagSeconds | None = None
+    """s, delay of the B-scans' time stamps, as of `sonotwin measure-lag`; free finds it with the probe, which must keep moving;
+    null takes none, of a capture to 0.1 s"""
     lag_sigma_s: NotNegative | None = None
     """s, standard deviation of the former, 0 where that is given; it counts where the probe moved as B-scans were taken"""
 
@@ -73,7 +85,18 @@ class Settings(ScaleFields, SequenceFields, tank_calibration.Settings):
             raise ValueError(f"body: expected none without a capture, found {self.body}{way}")
         if self.pairs is not None and self.phantom != phantom_frames.CROSSED_WIRES:
             raise ValueError(f"phantom: expected none with pairs, which are of one point, found {self.phantom}")
+        if self.lag_s == FREE and self.runs:
+            raise ValueError(f"lag_s: expected a number with runs, found {FREE}: find it by one of them")
+        if self.lag_s == FREE and self.lag_sigma_s is not None:
+            raise ValueError(f"lag_sigma_s: expected none with lag_s={FREE}, which finds both, found {self.lag_sigma_s}")
+        if self.lag_s == FREE and not hasattr(registry.kind(PHANTOMS, self.phantom), "misfit"):
+            raise ValueError(f"lag_s: expected a number with phantom={self.phantom}, by which none is found, found {FREE}")
         return self
+
+    @property
+    def taken_lag_s(self) -> float:
+        """Of the poses at first: the lag that is given, else none."""
+        return 0.0 if self.lag_s is None or self.lag_s == FREE else self.lag_s
 
     @property
     def lag_sigma(self) -> float:
@@ -116,7 +139,7 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     earlier = None if settings.earlier is None else probe_files.read(settings.earlier)
     if settings.temperature_c is not None:
         sound_in_water.speed_of_sound(settings.temperature_c)  # a mistake shows before the work
-    design, start = settings.rig.probe, perf_counter()
+    design, start, sweep = settings.rig.probe, perf_counter(), None
     if settings.pairs is not None:
         frames = phantom_frames.of_pairs(str(settings.pairs), design.image_size, *sweep_tables.read_pairs(settings.pairs))
     else:
@@ -125,16 +148,26 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
             sweep = sweep.from_body(settings.body)
         say_assumed(settings, watch)
         reference = None if settings.sequence is None else settings.frame_names(FrameNames()).reference
-        frames = look(sweep, settings, settings.lag_s or 0.0, settings.clip, watch, settings.lag_sigma, reference)
+        frames = look(sweep, settings, settings.taken_lag_s, settings.clip, watch, settings.lag_sigma, reference)
     seconds = {"seconds_find": round(perf_counter() - start, 3)}
     for line in probe_figures.describe_frames(frames, seconds["seconds_find"]):
         watch.say(line)
-    found = calibrate(frames, design, settings, settings.scanner_sy(design, usual), watch)
+    lag = None
+    if sweep is not None and settings.lag_s == FREE:
+        lag = find_lag(frames, sweep, settings)
+        frames = at_lag(frames, sweep, lag.seconds, lag.sigma_s, lag.jitter_s, settings.noise)
+    try:
+        found = calibrate(frames, design, settings, settings.scanner_sy(design, usual), watch)
+    except InputError as error:
+        raise InputError(f"{error}{'' if sweep is None else name_lag(frames, sweep, settings)}") from None
     figures = found.figures
+    if lag is not None:
+        figures = figures | measure_lag(lag, found)
+        watch.say(describe_lag(figures))
     if earlier is not None:
         figures = figures | probe_figures.compare(found.result.calibration, earlier)
         watch.say(probe_figures.describe_comparison(figures, settings.earlier))
-    written = write(out, found, figures | seconds)
+    written = write(out, found, figures | seconds, lag)
     watch.say(f"wrote       {out}/{{{','.join(written)}}}")
 
 
@@ -146,7 +179,7 @@ def say_assumed(settings: Settings, watch: Watch) -> None:
 
 
 def look(
-    sweep: SweepCapture | SequenceSweep,
+    sweep: Sweep,
     settings: tank_calibration.Settings | None = None,
     lag_s: float = 0.0,
     clip: Rectangle | None = None,
@@ -177,10 +210,105 @@ def look(
         chosen.appearance,
         part.corner,
         chosen.phantom,
-        tracks.rates_at(sweep.track, sweep.times, lag_s) if lag_sigma_s or sweep.clocked else None,
+        rates(sweep, lag_s) if lag_sigma_s or sweep.clocked else None,
         lag_sigma_s,
         known,
     )
+
+
+def rates(sweep: Sweep, lag_s: float) -> Array:
+    """Change of the B-scans' poses : (n, 4, 4) a second of lag, by poses whose noise is others'."""
+    moments = sweep.track.times[sweep.track.found]
+    apart_s = float(np.median(np.diff(moments))) * 1e-9 if len(moments) > 1 else 0.0
+    step_s = min(max(lateness.RATE_S, apart_s), tracks.MAX_GAP_S)
+    return tracks.rates_at(sweep.track, sweep.times, lag_s, step_s)
+
+
+def at_lag(frames: PhantomFrames, sweep: Sweep, lag_s: float, lag_sigma_s: float, jitter_s: float, noise: Noise) -> PhantomFrames:
+    """The frames of a sweep at poses of another lag, whose time stamps scatter by a standard deviation of some s."""
+    poses, moving = tracks.poses_at(sweep.track, sweep.times, lag_s), rates(sweep, lag_s)
+    covariance = sweep.pose_covariance(lag_s)
+    if covariance is None:  # between two poses half as much
+        shares = np.nan_to_num(tracks.shares_at(sweep.track, sweep.times, lag_s), nan=1.0)
+        covariance = (shares**2).sum(axis=1)[:, None, None] * noise.of_pose
+    turns = moving[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    motion = np.column_stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0], moving[:, :3, 3]])
+    covariance = covariance + jitter_s**2 * motion[:, :, None] * motion[:, None]
+    return phantom_frames.at_poses(frames, poses, covariance, moving, lag_sigma_s)
+
+
+def search_lag(frames: PhantomFrames, sweep: Sweep, settings: tank_calibration.Settings) -> tuple[float, float]:
+    """The lag of the least misfit, and that misfit; as `free_lag.search`."""
+    chosen = free_lag.few(np.array([each.reason in (None, NO_POSE) for each in frames.seen]))
+    few, track, times = phantom_frames.some(frames, chosen), sweep.track, sweep.times[chosen]
+    misfit = registry.kind(PHANTOMS, frames.phantom).misfit
+    return free_lag.search(
+        lambda lag_s: phantom_frames.at_poses(few, tracks.poses_at(track, times, lag_s)), lambda each: misfit(each, settings)
+    )
+
+
+def find_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> FreeLag:
+    """Find the lag with the probe, by the phantom.
+
+    Raises
+    ------
+    InputError
+        If the sweep has no times, the frames are too few or contradict each other, or the motion doesn't determine the lag.
+    """
+    phantom_frames.refuse_few(frames)
+    if not sweep.clocked:
+        raise InputError(f"{frames.name}: lag_s: expected a number for B-scans without time stamps in order, found {FREE}")
+    kind, expected = registry.kind(PHANTOMS, frames.phantom), settings.rig.probe.target_from_image.matrix()
+
+    def adjust(each: PhantomFrames) -> Lateness:
+        try:
+            return kind.calibrate(each, settings, expected).late
+        except InputError as error:
+            first, last = latency.SEARCH_S
+            raise InputError(f"{error}; of lags from {first:g} to {last:g} s, {start:.2f} s fits best") from None
+
+    try:
+        start, _ = search_lag(frames, sweep, settings)
+        return free_lag.find(
+            start,
+            lambda lag_s, jitter_s: at_lag(frames, sweep, lag_s, 0.0, jitter_s, settings.noise),
+            adjust,
+        )
+    except InputError as error:
+        raise InputError(f"{frames.name}: {error}") from None
+
+
+def name_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> str:
+    """The lag at which frames that contradict each other would agree, in words; nothing without one."""
+    kind = registry.kind(PHANTOMS, frames.phantom)
+    if settings.lag_s == FREE or not sweep.clocked or not hasattr(kind, "misfit") or len(frames.usable) < kind.MIN_FRAMES:
+        return ""
+    try:
+        lag_s, least = search_lag(frames, sweep, settings)
+    except InputError:
+        return ""
+    here = kind.misfit(phantom_frames.at_poses(frames, tracks.poses_at(sweep.track, sweep.times, settings.taken_lag_s)), settings)
+    if here < free_lag.CONTRADICTS_MM2 or abs(lag_s - settings.taken_lag_s) < free_lag.STEPS_S[0] or least > here / 2:
+        return ""
+    return f"; with lag_s={lag_s:.2f} they agree: give lag_s={FREE}"
+
+
+def measure_lag(lag: FreeLag, found: CalibratedProbe) -> Metrics:
+    """Figures of a lag that was found with the probe, and its correlation with each of the probe's parameters."""
+    correlations = lag.correlations(found.result.adjustment.calibration)
+    return {
+        "lag_ms": 1e3 * lag.seconds,
+        "lag_sigma_ms": 1e3 * lag.sigma_s,
+        "jitter_ms": 1e3 * lag.jitter_s * max(found.result.adjustment.noise_factor, 1.0),
+        **{f"lag_correlation_{name}": value for name, value in correlations.items()},
+    }
+
+
+def describe_lag(figures: Metrics) -> str:
+    """One line: the lag, and the scatter of the time stamps."""
+    strongest = max(abs(value) for name, value in figures.items() if name.startswith("lag_correlation_"))
+    by = f"time stamps scatter by {figures['jitter_ms']:.1f} ms; correlation with the probe up to {strongest:.2f}"
+    return f"lag         {figures['lag_ms']:.1f} ± {figures['lag_sigma_ms']:.1f} ms, the images after the poses; {by}"
 
 
 def calibrate(
@@ -211,12 +339,15 @@ def calibrate(
     return CalibratedProbe(frames, result, figures | seconds)
 
 
-def write(out: Path, found: CalibratedProbe, figures: Metrics) -> list[str]:
-    """Write all files, whole or not at all; returns their names."""
+def write(out: Path, found: CalibratedProbe, figures: Metrics, lag: FreeLag | None = None) -> list[str]:
+    """Write all files, whole or not at all, with that of a lag that was found; returns their names."""
     with atomic.new_folder(out, BY) as folder:
+        if lag is not None:
+            file = LagFile(lag_s=lag.seconds, sigma_s=lag.sigma_s, interval_s=lag.interval_s, coverage=latency.COVERAGE)
+            lag_files.write(folder / lag_files.FILE, file)
         probe_files.write(folder / PROBE, found.result.calibration)
         probe_files.write_authors(folder / probe_files.AUTHORS, found.result.calibration)
         rows = probe_figures.rows(found.frames, found.result.adjustment)
         sweep_tables.write_rows(folder / FRAMES, probe_figures.COLUMNS, rows)
         metrics.write(folder / metrics.FILE, figures)
-    return [PROBE, probe_files.AUTHORS, FRAMES, metrics.FILE]
+    return [PROBE, probe_files.AUTHORS, FRAMES, *([] if lag is None else [lag_files.FILE]), metrics.FILE]

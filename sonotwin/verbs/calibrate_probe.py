@@ -10,12 +10,13 @@ Give several runs, in one capture or many, for their repeatability: CR1 and CR2 
 covariances predict, whether the runs scatter more than that (chi-square), and each run's crossing by the others' calibration
 (held out). probe.yaml is then their mean, with a covariance that has the scatter in it, and runs.csv has a row a run.
 
-Let the probe rest at each frame, or give the lag. Tilt it by 35 degrees, mostly forward and backward, roll it as far as the
-target is seen, and bring the crossing near all corners of the image in turn. N-wires stay in view whole: by PLUS's
-configuration with the phantom's registration little motion will do, without it turn the probe about two axes. A stylus is
-tracked as a further body, and its tip led to all corners of the image; where tip.yaml has that, nothing needs to be turned. Over
-a rough wall take 100 poses: tilt the probe to 40 degrees forward and backward, rock it to 25, roll it and change the distance.
-About a sphere do the same, with its top beside the image's plane as often as in it.
+Let the probe rest at each frame, or give the lag; or keep moving, and lag_s=free finds it as well, and writes it to lag.json.
+Tilt the probe by 35 degrees, mostly forward and backward, roll it as far as the target is seen, and bring the crossing near all
+corners of the image in turn. N-wires stay in view whole: by PLUS's configuration with the phantom's registration little motion
+will do, without it turn the probe about two axes. A stylus is tracked as a further body, and its tip led to all corners of the
+image; where tip.yaml has that, nothing needs to be turned. Over a rough wall take 100 poses: tilt the probe to 40 degrees
+forward and backward, rock it to 25, roll it and change the distance. About a sphere do the same, with its top beside the
+image's plane as often as in it.
 
     sonotwin calibrate-probe capture=outputs/wires/capture out=outputs/probe
     sonotwin calibrate-probe capture=outputs/wires/capture temperature_c=22.4 out=outputs/probe
@@ -26,6 +27,7 @@ About a sphere do the same, with its top beside the image's plane as often as in
     sonotwin calibrate-probe phantom=sphere sphere_radius_mm=19.8 capture=outputs/ball/capture temperature_c=22 out=outputs/probe
     sonotwin calibrate-probe phantom=stylus body=needle tip=outputs/tip/tip.yaml capture=outputs/stylus/track out=outputs/probe
     sonotwin calibrate-probe phantom=stylus sequence=stylus.igs.mha reference=Stylus tip=outputs/tip/tip.yaml out=outputs/probe
+    sonotwin calibrate-probe capture=outputs/wires/capture lag_s=free out=outputs/probe
     sonotwin calibrate-probe pairs=pairs.csv out=outputs/probe
     sonotwin calibrate-probe runs=[outputs/session/capture] temperature_c=22.4 out=outputs/probe
     sonotwin calibrate-probe runs=[outputs/monday/probe.yaml,outputs/friday/probe.yaml] out=outputs/probe
@@ -43,7 +45,7 @@ class Config(probe_step.Settings):
     """Fields of `sonotwin calibrate-probe`: sources, target, and all that is known beforehand."""
 
     out: Path
-    """folder; gets probe.yaml, US_params.npz, frames.csv, metrics.json, and of several runs runs.csv"""
+    """folder; gets probe.yaml, US_params.npz, frames.csv, metrics.json, lag.json of lag_s=free, and of several runs runs.csv"""
 
 
 def run(config: Config) -> None:

@@ -12,15 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.capture import probe_files, sweep_tables
+from recon.capture import lag_files, probe_files, sweep_tables
 from recon.geometry import rigid
+from recon.model.probe import NAMES
 from recon.probe_calibration import phantom_frames, point_calibration, probe_checks, repeatability, sound_in_water
 from sonotwin import config
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
 from sonotwin.verbs import calibrate_probe, reconstruct
 from tests import added
-from tests.recon import bscans, probe_motions, sweep_sets
+from tests.recon import bscans, captures, moving_phantoms, probe_motions, sweep_sets
 
 LAG_S = 0.03
 FILES = [".sonotwin.json", "US_params.npz", "frames.csv", "metrics.json", "probe.yaml"]
@@ -63,6 +64,25 @@ def test_b_scans_become_a_calibration(calibrated, rig):
     ]
     assert re.fullmatch(r"find +30 frames, 321x408: crossing in 28, 2 rejected, \d+ s", lines[0])
     assert "1 no echo stands out: frame 4" in lines[1] and "1 the target was not tracked: frame 12" in lines[2]
+
+
+@pytest.mark.slow
+def test_the_lag_is_found_with_the_probe(tmp_path, rig, rng, capsys):
+    """Of B-scans 60 ms late, that a moving probe took: its file is one of measure-lag; else they are refused by its name."""
+    sweep, frames = moving_phantoms.over_crossing(rig, 0.06, rng, seconds=20.0)
+    images = (bscans.image(bscans.spot(each.pixel) + bscans.face(), rng) for each in frames.seen)
+    captures.write_sweep(tmp_path / "capture", images, sweep.times, sweep.track, bscans.SIZE, name="moving")
+    out, fields = tmp_path / "out", [f"capture={tmp_path / 'capture'}", "tank_speed=1540"]
+    lines = calibrate(*fields, "lag_s=free", f"out={out}")
+    assert sorted(path.name for path in out.iterdir()) == sorted([*FILES, "lag.json"])
+    found, figures = lag_files.read(out / "lag.json"), json.loads((out / "metrics.json").read_text())
+    assert abs(found.lag_s - 0.06) < 4 * found.sigma_s < 0.008
+    assert figures["lag_ms"] == pytest.approx(1e3 * found.lag_s)
+    assert all(abs(figures[f"lag_correlation_{name}"]) < 1 for name in NAMES)
+    assert any(line.startswith("lag ") for line in lines)
+    assert complaint(capsys, *fields, f"out={tmp_path / 'late'}").endswith("with lag_s=0.06 they agree: give lag_s=free")
+    for more in (["lag_sigma_s=0.01"], ["pairs=a.csv", "capture=null"]):
+        assert "lag" in complaint(capsys, *fields, *more, "lag_s=free", f"out={tmp_path / 'none'}")
 
 
 def test_a_bracket_that_was_bent_since_is_noticed(calibrated, capture):

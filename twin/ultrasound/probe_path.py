@@ -2,11 +2,13 @@
 bottom; or from rest to rest about wires, or over a wall or a sphere.
 """
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -24,6 +26,7 @@ Array = NDArray[np.float64]
 
 RATE_HZ = 100.0  # of the poses that make up a path
 MOST_S = 3600.0  # of a path
+Rest = Annotated[float, Field(ge=0, le=60)]  # s
 CALM = tremor.draw(0.0, 0.0, 0)  # a hand without tremor
 
 
@@ -77,7 +80,7 @@ class Bob(Part):
 
 
 class WirePath(Part):
-    """At rest in poses about two crossed wires, as the probe is calibrated; turned as in
+    """At rest in poses about two crossed wires, as the probe is calibrated, or moving from pose to pose; turned as in
     `recon.probe_calibration.point_calibration.motion`.
     """
 
@@ -87,11 +90,14 @@ class WirePath(Part):
     tilt_deg: Annotated[float, Field(ge=0, le=80)] = 35.0  # to all sides
     roll_deg: Annotated[float, Field(ge=0, le=180)] = 180.0  # about the depth axis, both ways
     miss_mm: NotNegative = 0.2  # standard deviation of the crossing across the image plane: a hand holds it where it shines most
-    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+    rest_s: Rest = 0.5  # in each pose, an image in the middle; 0 keeps moving, images at the scanner's rate
+    move_s: Annotated[float, Field(ge=0.3, le=60)] = 1.0  # from one pose to the next
 
 
 class RowPath(Part):
-    """At rest in poses over N-wires, as the probe is calibrated by them: turned to all sides as far as all wires stay in view."""
+    """At rest in poses over N-wires, as the probe is calibrated by them, or moving from pose to pose: turned to all sides as far
+    as all wires stay in view.
+    """
 
     kind: Literal["rows"] = "rows"
     count: Annotated[int, Field(ge=1, le=1000)] = 40  # poses, one image each
@@ -99,7 +105,8 @@ class RowPath(Part):
     roll_deg: Annotated[float, Field(ge=0, le=60)] = 20.0  # about the depth axis, both ways
     rock_deg: Annotated[float, Field(ge=0, le=60)] = 8.0  # in the image's plane
     along_mm: NotNegative = 10.0  # both ways along the wires, from their middle
-    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+    rest_s: Rest = 0.5  # in each pose, an image in the middle; 0 keeps moving, images at the scanner's rate
+    move_s: Annotated[float, Field(ge=0.3, le=60)] = 1.0  # from one pose to the next
 
 
 class TiltPath(Part):
@@ -196,7 +203,7 @@ def crossing(body: Body) -> Array:
 
 
 def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
-    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+    """Poses `world_from_image` over time, from 0 ns, and the middles of the rests : (count,) ns; none of a path without.
 
     The crossing appears at the pixels of the protocol, the delays of the medium's sound included.
 
@@ -208,16 +215,26 @@ def about_crossing(path: WirePath, body: Body, transducer: Transducer, seed: int
     whole = point_calibration.motion(transducer.image_size, path.first + path.count, path.tilt_deg, path.roll_deg)
     turns, pixels = (part[path.first :] for part in whole)
     beside = path.miss_mm * np.random.default_rng(seed).standard_normal(path.count)
-    poses = held(body, transducer, turns, pixels, beside)
-    return _rests(poses, path.rest_s)
+
+    def pose(values: Array) -> Array:
+        return held(body, transducer, values[:, :3], values[:, 3:5], values[:, 5])
+
+    return _led_through(np.column_stack([turns, pixels, beside]), pose, path.rest_s, path.move_s)
 
 
-def _rests(poses: Array, rest_s: float) -> tuple[Track, NDArray[np.int64]]:
-    """Poses over time at rest in each of some : (count, 4, 4), and the middles of the rests : (count,) ns."""
+def _led_through(values: Array, pose: Callable[[Array], Array], rest_s: float, move_s: float) -> tuple[Track, NDArray[np.int64]]:
+    """Poses over time of some coordinates : (count, k), of which `pose` makes poses, with the middles of the rests : (count,) ns.
+
+    A probe that rests is tracked at rest only, as over its moves of `move_s` no pose is interpolated. Without rests it is led
+    smoothly from pose to pose, and slows down where a coordinate turns back.
+    """
+    if rest_s == 0:
+        times = np.arange(int((len(values) - 1) * move_s * RATE_HZ) + 1) / RATE_HZ
+        led = PchipInterpolator(move_s * np.arange(len(values)), values)(times) if len(values) > 1 else values
+        return Track(np.rint(times * 1e9).astype(np.int64), pose(led)), np.zeros(0, np.int64)
     steps = np.rint(np.linspace(0, rest_s, int(rest_s * RATE_HZ) + 1) * 1e9).astype(np.int64)
-    move_s = 1.0  # from one rest to the next; over such a gap no pose is interpolated
-    starts = np.rint(np.arange(len(poses)) * (rest_s + move_s) * 1e9).astype(np.int64)
-    rests = Track((starts[:, None] + steps).ravel(), np.repeat(poses, len(steps), axis=0))
+    starts = np.rint(np.arange(len(values)) * (rest_s + move_s) * 1e9).astype(np.int64)
+    rests = Track((starts[:, None] + steps).ravel(), np.repeat(pose(values), len(steps), axis=0))
     return rests, starts + steps[-1] // 2
 
 
@@ -225,7 +242,7 @@ LEVEL = np.cos(np.deg2rad(20))  # of the wires' direction, the part that is leve
 
 
 def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
-    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+    """Poses `world_from_image` over time, from 0 ns, and the middles of the rests : (count,) ns; none of a path without.
 
     The middle of all wires appears near the middle of the image.
 
@@ -240,21 +257,23 @@ def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) 
     along = ends[0, 1] - ends[0, 0]
     along /= np.linalg.norm(along)
     rng = np.random.default_rng(seed)
-    tilt, roll, rock, shift = rng.uniform(-1, 1, (4, path.count)) * [
-        [path.tilt_deg], [path.roll_deg], [path.rock_deg], [path.along_mm]
-    ]  # fmt: skip
+    values = rng.uniform(-1, 1, (4, path.count)).T * [path.tilt_deg, path.roll_deg, path.rock_deg, path.along_mm]
     array = np.array([along[1], -along[0], 0.0])  # across wires that lie level
     if (level := float(np.linalg.norm(array))) < LEVEL:
         found = f"them {np.degrees(np.arccos(level)):.0f} deg from it: z of their definition is up"
         raise InputError(f"path: expected wires that lie level, to be crossed from above, found {found}")
     array /= level
     upright = np.column_stack([array, [0, 0, 1], np.cross(array, [0, 0, 1])])
-    rotations = upright @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
     true_scale = np.array(transducer.scale_mm_per_px) * [1.0, body.medium.speed / transducer.assumed_speed]
     middle = np.append((np.array(transducer.image_size) - 1) / 2 * true_scale, 0.0)
-    places = ends.mean(axis=(0, 1)) + shift[:, None] * along
-    poses = np.stack([rigid.transform(turn, place - turn @ middle) for turn, place in zip(rotations, places, strict=True)])
-    return _rests(poses, path.rest_s)
+
+    def pose(values: Array) -> Array:
+        tilt, roll, rock, shift = values.T
+        rotations = upright @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
+        places = ends.mean(axis=(0, 1)) + shift[:, None] * along
+        return np.stack([rigid.transform(turn, place - turn @ middle) for turn, place in zip(rotations, places, strict=True)])
+
+    return _led_through(values, pose, path.rest_s, path.move_s)
 
 
 def over_surface(path: TiltPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:

@@ -92,10 +92,12 @@ def plan_sweep(
             taken = moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
         case WirePath():
-            course, taken = about_crossing(path, body, transducer, path_seed)
+            course, rests = about_crossing(path, body, transducer, path_seed)
+            taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
         case RowPath():
-            course, taken = over_rows(path, body, transducer, path_seed)
+            course, rests = over_rows(path, body, transducer, path_seed)
+            taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
         case TiltPath():
             course, taken = over_surface(path, body, transducer, path_seed)

@@ -9,6 +9,8 @@ A module has
 - `sight(seen, poses, covariance, rates, lag_sigma_s)`: all of these, as the calibration takes them, with the poses of their
   frames, their covariance, their change a second of the B-scans' lag, and its standard deviation;
 - `calibrate(frames, settings, expected)`: a `phantom_frames.Adjusted`, by `phantom_frames.PhantomFrames`;
+- `misfit(frames, settings)`, where it serves to find the B-scans' lag: mean square distance, mm^2, from where the phantom is
+  likeliest, large ones cut, by a quick robust start; the adjustment of such a phantom has `late`, a `lateness.Lateness`;
 - `figures(found)` and `describe(found, settings)` of that one: `Metrics`, and lines, besides those of all phantoms.
 
 A phantom that shows one point has but `find` of its own, the rest is in `recon.probe_calibration.point_phantom`;

@@ -19,7 +19,7 @@ from recon.probe_calibration.wire_dots import Dots
 
 Array = NDArray[np.float64]
 
-__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "read", "sight"]
+__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "misfit", "read", "sight"]
 SHOWS = "dots of all wires"
 WAYS = {
     "no echo stands out": "another scanner? give appearance.min_contrast_db",
@@ -54,18 +54,28 @@ def sight(seen: Sequence[Dots], poses: Array, covariance: Array | None, rates: A
     return DotSightings(poses, pixels, own, covariance, rates, lag_sigma_s)
 
 
-def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> LineAdjustment:
-    """Calibrate by all dots; an earlier calibration beside the wires is taken for the design."""
-    known: PlusPhantom = frames.known
+def _wires(known: PlusPhantom, settings: Settings) -> Wires:
+    """The wires with their registration, if they have one."""
     registration = None
     if known.reference_from_phantom is not None:
         registration = Registration(rigid.nearest(known.reference_from_phantom), settings.registration_sigma_mm)
+    return Wires(known.wires, settings.wire_place_sigma_mm, registration, settings.echo_ahead_mm, settings.echo_ahead_sigma_mm)
+
+
+def misfit(frames: PhantomFrames, settings: Settings) -> float:
+    """Mean square distance of the dots from their wires, as `line_calibration.misfit`."""
+    return line_calibration.misfit(frames.sightings, _wires(frames.known, settings), settings.noise)
+
+
+def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> LineAdjustment:
+    """Calibrate by all dots; an earlier calibration beside the wires is taken for the design."""
+    known: PlusPhantom = frames.known
     earlier = known.target_from_pixel
     if earlier is not None:
         expected = line_calibration.pose_of(earlier)[0]
     return line_calibration.calibrate(
         frames.sightings,
-        Wires(known.wires, settings.wire_place_sigma_mm, registration, settings.echo_ahead_mm, settings.echo_ahead_sigma_mm),
+        _wires(known, settings),
         frames.size,
         settings.noise,
         expected,
@@ -88,8 +98,8 @@ def figures(found: LineAdjustment) -> Metrics:
         "phantom_size": found.size[0],
         "phantom_size_sigma": found.size[1],
         "frames_that_count_as_one": found.persistence,
-        "more_lag_s": found.more_lag_s[0],
-        "more_lag_sigma_s": found.more_lag_s[1],
+        "more_lag_s": np.nan if found.late is None else found.late.seconds,
+        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
     }
 
 

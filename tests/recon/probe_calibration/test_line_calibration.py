@@ -162,7 +162,7 @@ def test_a_lag_is_measured(probe, rng):
     sightings = replace(wire_rows.observe(probe, FCAL, poses, rng), pose_rates=rates)
     assert not list(calibrate(sightings).doubts())
     late = calibrate(replace(sightings, poses=_moved(sightings.poses, rates, lag_s)))
-    assert abs(late.more_lag_s[0] - lag_s) < 4 * late.more_lag_s[1] < lag_s
+    assert abs(late.late.seconds - lag_s) < 4 * late.late.sigma_s < lag_s
     assert "late by" in next(late.doubts())
 
 

@@ -152,3 +152,15 @@ def test_a_scene_without_a_surface_to_tilt_over_is_refused(cylinders, clean):
         over_surface(TiltPath(), cylinders, clean)
     with pytest.raises(InputError, match=r"found tank, wire0, wire1"):
         over_surface(TiltPath(), body(build_scene({"kind": "crosswire"})), clean)
+
+
+def test_a_probe_that_keeps_moving_stays_over_the_wires(clean):
+    """Without rests it goes through the poses of one that rests, smoothly, and has a pose at any moment."""
+    wired = body(build_scene({"kind": "n_wires"}))
+    rests, middles = over_rows(RowPath(count=6), wired, clean)
+    course, none = over_rows(RowPath(count=6, rest_s=0, move_s=2.0), wired, clean)
+    assert len(none) == 0 and course.times[-1] == 10_000_000_000
+    through = tracks.at(course, np.arange(6) * 2_000_000_000)
+    assert through == pytest.approx(tracks.at(rests, middles), abs=1e-9)
+    steps = np.linalg.norm(np.diff(course.poses[:, :3, 3], axis=0), axis=1)
+    assert np.abs(np.diff(steps)).max() < 0.05 * steps.max() + 1e-3, "mm in 10 ms: no jerk"
