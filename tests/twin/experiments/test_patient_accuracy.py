@@ -8,6 +8,7 @@ from twin.experiments import patient_accuracy
 from twin.experiments.experiment_setup import Setup
 
 
+@pytest.mark.slow
 def test_a_tracked_patient_may_move(rig):
     """By 20 mm and 5 deg; eight sessions, whose ratio errs by 0.15 (1 sigma) about the 1.08 of sixty."""
     setup = Setup(rig, lifelike=Conditions.model_validate(choices.read("conditions", "lifelike")))

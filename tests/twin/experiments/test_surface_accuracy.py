@@ -38,11 +38,13 @@ def test_sphere_of_the_paper(setup):
     check(surface_accuracy.sphere, setup)
 
 
+@pytest.mark.slow
 def test_breast(setup, rig):
     """Coverage, RMS, hardly a point off by more than 1 mm: amid the image, whose fringes can be followed everywhere."""
     check(surface_accuracy.breast, replace(setup, rig=rig.model_copy(update={"cam1": cropped(rig.cam1, (720, 600))})))
 
 
+@pytest.mark.slow
 def test_breast_by_both_cameras(setup):
     """Less noise, as predicted, by cameras of half the size, at whose borders not all fringes can be followed."""
     half = setup.rig.model_copy(update={"cam2": shrunk(setup.rig.cam2, 2)})
