@@ -120,7 +120,8 @@ class TiltPath(Part):
     depth_mm: tuple[Positive, Positive] = (13.0, 38.0)  # of the surface before the array's middle, least and most
     aside_mm: NotNegative = 8.0  # of a sphere's middle along the array, or along a wall, both ways
     miss_mm: NotNegative = 8.0  # likewise across the image plane, or the other way along a wall
-    rest_s: Annotated[float, Field(ge=0.1, le=60)] = 0.5  # in each pose; the image is taken in the middle
+    rest_s: Rest = 0.5  # in each pose, an image in the middle; 0 keeps moving, images at the scanner's rate
+    move_s: Annotated[float, Field(ge=0.3, le=60)] = 1.0  # from one pose to the next
 
 
 def along_surface(path: SurfacePath, solid: Solid, transducer: Transducer, seed: int, shaken: Tremor = CALM) -> Track:
@@ -277,7 +278,7 @@ def over_rows(path: RowPath, body: Body, transducer: Transducer, seed: int = 0) 
 
 
 def over_surface(path: TiltPath, body: Body, transducer: Transducer, seed: int = 0) -> tuple[Track, NDArray[np.int64]]:
-    """Poses `world_from_image` over time, from 0 ns, at rest only; and the middles of the rests : (count,) ns.
+    """Poses `world_from_image` over time, from 0 ns, and the middles of the rests : (count,) ns; none of a path without.
 
     A wall lies a depth before the array's middle, near the middle of its upper face; a sphere likewise, but for places aside.
 
@@ -288,21 +289,23 @@ def over_surface(path: TiltPath, body: Body, transducer: Transducer, seed: int =
     """
     middle, radius = _surface(body)
     rng = np.random.default_rng(seed)
-    tilt, rock, roll, aside, miss = rng.uniform(-1, 1, (5, path.count)) * [
-        [path.tilt_deg], [path.rock_deg], [path.roll_deg], [path.aside_mm], [path.miss_mm]
-    ]  # fmt: skip
-    depth = rng.uniform(*sorted(path.depth_mm), path.count)
-    rotations = _upright(0.0) @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
-    beside, none = np.column_stack([aside, 0 * aside, miss]), np.zeros(path.count)
-    places = np.append(transducer.face_mm, 0.0) + np.column_stack([none, depth + radius, none])
-    aims = np.tile(middle, (path.count, 1))
-    if radius:
-        places += beside
-    else:
-        aims += beside[:, [0, 2, 1]]
-    turned = np.einsum("nij,nj->ni", rotations, places)
-    poses = np.stack([rigid.transform(turn, place) for turn, place in zip(rotations, aims - turned, strict=True)])
-    return _rests(poses, path.rest_s)
+    most = [path.tilt_deg, path.rock_deg, path.roll_deg, path.aside_mm, path.miss_mm]
+    values = np.column_stack([rng.uniform(-1, 1, (5, path.count)).T * most, rng.uniform(*sorted(path.depth_mm), path.count)])
+
+    def pose(values: Array) -> Array:
+        tilt, rock, roll, aside, miss, depth = values.T
+        rotations = _upright(0.0) @ Rotation.from_euler("YXZ", np.column_stack([roll, tilt, rock]), degrees=True).as_matrix()
+        none = np.zeros(len(values))
+        places = np.append(transducer.face_mm, 0.0) + np.column_stack([none, depth + radius, none])
+        aims = np.tile(middle, (len(values), 1))
+        if radius:
+            places += np.column_stack([aside, none, miss])
+        else:
+            aims += np.column_stack([aside, miss, none])
+        turned = np.einsum("nij,nj->ni", rotations, places)
+        return np.stack([rigid.transform(turn, place) for turn, place in zip(rotations, aims - turned, strict=True)])
+
+    return _led_through(values, pose, path.rest_s, path.move_s)
 
 
 def _surface(body: Body) -> tuple[Array, float]:

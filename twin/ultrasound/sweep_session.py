@@ -100,7 +100,8 @@ def plan_sweep(
             taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
         case TiltPath():
-            course, taken = over_surface(path, body, transducer, path_seed)
+            course, rests = over_surface(path, body, transducer, path_seed)
+            taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 
