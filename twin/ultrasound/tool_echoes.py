@@ -68,8 +68,9 @@ class _Line(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """Facets in the face's frame, for compiled code."""
+    """Facets for compiled code, as of `tool_surface.Facets`."""
 
+    pose: Array  # (4, 4) of their frame in the face's
     place: Array
     normal: Array
     area: Array
@@ -122,10 +123,8 @@ def _bounce(shaft: Shaft, around: Tissue) -> float:
 
 
 def _surface(shaft: Shaft, around: Tissue, transducer: Transducer) -> _Surface:
-    found, pose = facets(form_of(shaft)), frame_of(shaft)
-    places, normals = rigid.apply(pose, found.place), rigid.rotate(pose, found.normal)
     wavelength = transducer.wavelength_mm * around.speed / transducer.assumed_speed
-    return _Surface(places, normals, *found[2:], _bounce(shaft, around), wavelength)
+    return _Surface(frame_of(shaft), *facets(form_of(shaft)), _bounce(shaft, around), wavelength)
 
 
 def _between_lines() -> NDArray[np.float32]:
@@ -235,15 +234,22 @@ def _lay_facets(field, tool, between, scanner, beam, paths):
     lines, depths = paths.labels.shape
     pad = (len(field) - lines) // 2
     deepest, k = paths.step_mm * (depths - 2), scanner.wavenumber
+    pose = tool.pose
     for n in range(len(tool.area)):
-        along, depth = on_lines(tool.place[n, 0], tool.place[n, 1], scanner.bend, scanner.middle_mm)
+        a, b, c = tool.place[n]
+        x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
+        y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
+        z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+        along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
         if not (0 < depth < deepest):
             continue
         angle = (along - scanner.middle_mm) * scanner.bend
-        cosine = -(tool.normal[n, 0] * np.sin(angle) + tool.normal[n, 1] * np.cos(angle))
+        a, b, c = tool.normal[n]
+        nx, ny = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c, pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c
+        cosine = -(nx * np.sin(angle) + ny * np.cos(angle))
         if cosine <= 0:
             continue
-        weight = _across(beam, depth, tool.place[n, 2]) * _fade(depth)
+        weight = _across(beam, depth, z) * _fade(depth)
         if abs(weight) < 1e-9:
             continue
         line = min(max(int(along / scanner.line_mm + 0.5), 0), lines - 1)
