@@ -109,9 +109,9 @@ def _line(shaft: Shaft, around: Tissue, transducer: Transducer, scanner: Scanner
 
 def layers_of(shaft: Shaft, around: Tissue, transducer: Transducer, step_mm: float) -> Layers:
     """A shaft in a medium, as its echo depends on it."""
-    filling = shaft.filling or around
-    media = (_medium(each, transducer) for each in (around, shaft.material, filling))
-    return Layers(shaft.radius, shaft.bore, *media, transducer.wavenumber, transducer.assumed_speed, step_mm)
+    outside, wall, filling = (_medium(each, transducer) for each in (around, shaft.material, shaft.filling or around))
+    sound = transducer.wavenumber, transducer.assumed_speed
+    return Layers(shaft.radius, shaft.bore, outside, wall, filling, *sound, step_mm)
 
 
 def _medium(tissue: Tissue, transducer: Transducer) -> tuple[float, float, float]:
