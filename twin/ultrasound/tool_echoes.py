@@ -27,7 +27,7 @@ from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
-ALONG_MM = 0.04  # between points of a shaft's line: 2.4 rad of phase both ways where it is steepest
+ALONG = 1 / 5  # wavelengths between points of a shaft's line: 2.5 rad of phase both ways where it is steepest
 TAPS, PLACES = 12, 64  # of the filter between lines, and places between two lines that it is tabled for
 FILTER_EDGE, FILTER_BETA = 0.5, 5.65  # cycles a line, in the middle of its slope from 0.35 to 0.65; Kaiser's, for -60 dB
 FAINTEST = 2e-3  # of the strongest sample of a shaft's echo, where it ends
@@ -56,12 +56,12 @@ class Tool:
 class _Line(NamedTuple):
     """A shaft's axis in the face's frame, for compiled code."""
 
-    first: Array  # (3,) mm, its middle end, where the tip begins
+    first: Array  # (3,) mm, where the tip begins
     back: Array  # (3,) unit, from there to the rear
     count: int
     step_mm: float
     radius: float
-    smooth: Array  # (count,) amplitude that roughness leaves, square to the beam; its logarithm over cos² of the tilt
+    smooth: Array  # (count,) logarithm of the amplitude that roughness leaves, square to the beam
     echo: NDArray[np.complex64]  # (tilts, n) mm
     last: NDArray[np.int64]  # (tilts,) samples that count
     bounce: float  # of amplitude at its front
@@ -93,18 +93,16 @@ def tool_echoes(tool: Tool, body: Body, transducer: Transducer, beam: Beam, path
 
 def _line(shaft: Shaft, around: Tissue, transducer: Transducer, scanner: Scanner) -> _Line:
     """The whole cylinder behind the tip."""
-    form = form_of(shaft)
-    blunt = blunt_mm(form)
-    length = max(min(shaft.length, SEEN_MM) - blunt, 0.0)
-    count = int(length / ALONG_MM)
-    behind = blunt + ALONG_MM * (np.arange(count) + 0.5)
+    blunt, step = blunt_mm(form_of(shaft, transducer.wavelength_mm)), ALONG * transducer.wavelength_mm
+    count = int(max(min(shaft.length, SEEN_MM) - blunt, 0.0) / step)
+    behind = blunt + step * (np.arange(count) + 0.5)
     rough = np.where(behind < shaft.etched, shaft.etched_roughness, shaft.material.roughness)
     echo = resonance(layers_of(shaft, around, transducer, scanner.sample_mm))
     smooth = -0.5 * (2 * scanner.wavenumber * rough) ** 2
     first = shaft.ends[1] - blunt * shaft.along
     loud = np.abs(echo) > FAINTEST * np.abs(echo).max()
     last = echo.shape[1] - loud[:, ::-1].argmax(axis=1)
-    return _Line(first, -shaft.along, count, ALONG_MM, shaft.radius, smooth, echo, last, _bounce(shaft, around))
+    return _Line(first, -shaft.along, count, step, shaft.radius, smooth, echo, last, _bounce(shaft, around))
 
 
 def layers_of(shaft: Shaft, around: Tissue, transducer: Transducer, step_mm: float) -> Layers:
@@ -124,7 +122,7 @@ def _bounce(shaft: Shaft, around: Tissue) -> float:
 
 def _surface(shaft: Shaft, around: Tissue, transducer: Transducer) -> _Surface:
     wavelength = transducer.wavelength_mm * around.speed / transducer.assumed_speed
-    return _Surface(frame_of(shaft), *facets(form_of(shaft)), _bounce(shaft, around), wavelength)
+    return _Surface(frame_of(shaft), *facets(form_of(shaft, transducer.wavelength_mm)), _bounce(shaft, around), wavelength)
 
 
 def _between_lines() -> NDArray[np.float32]:
