@@ -153,7 +153,8 @@ class CaptureWriter:
                 raise ValueError("times: expected them strictly increasing")
         place = manifest.sweep_part(name)
         poses = None if track is None else f"{place}/{manifest.TRACK}"
-        others = {body: manifest.body_track(place, body) for body in bodies or {}}
+        bodies = bodies or {}
+        others = {body: manifest.body_track(place, body) for body in bodies}
         folders = {device: f"{place}/{device}" for device in times}
         part = SweepPart(purpose=purpose, images=folders, track=poses, bodies=others or None)
         self._add(place, part, devices)

@@ -220,14 +220,14 @@ def write_session(
         own = truth.own.relative_to(truth.folder)
         truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
 
-        shown: dict[str, list[dict[str, NDArray]]] = {body: [] for body in bodies}
+        shown: dict[str, list[dict[str, NDArray]]] = {one: [] for one in bodies}
 
         def images() -> Iterator[tuple[str, NDArray[np.uint8]]]:
             for number, one in enumerate(scans):
-                for body, led in bodies.items():
+                for further, led in bodies.items():
                     if led.shaft is not None:
                         shaft, pose = led.shaft.moved(led.scanned.poses[number]), planned.truth.poses[number]
-                        shown[body].append(tool_truth.placed(shaft, transducer, one.paths, pose))
+                        shown[further].append(tool_truth.placed(shaft, transducer, one.paths, pose))
                 labels = bscan_truth.labels(one.paths, transducer)
                 write_images([truth.own / LABELS / image_name(number)], labels[None])
                 yield SCANNER, one.image
@@ -239,18 +239,20 @@ def write_session(
             times |= dict.fromkeys(film.devices, film.times)
             devices |= film.devices
         name = session.part.partition("/")[2]
-        track, tracks = (planned.track, {body: one.track for body, one in bodies.items()}) if film is None else (None, {})
+        track, tracks = (planned.track, {further: led.track for further, led in bodies.items()}) if film is None else (None, {})
         capture.add_sweep(times, images(), devices, track, name, session.purpose, tracks)
-        for body, one in bodies.items():
-            arrays = {"times_ns": one.truth.times, "world_from_target": one.truth.poses}
-            truth.write_arrays(str(own / BODIES / f"{body}.npz"), arrays)
-            arrays = {"times_ns": one.scanned.times, "world_from_target": one.scanned.poses}
-            arrays |= {key: np.array([each[key] for each in shown[body]]) for key in (shown[body] or [{}])[0]}
-            truth.write_arrays(str(own / SCANS / f"{body}.npz"), arrays)
+        for further, led in bodies.items():
+            truth.write_arrays(str(own / BODIES / f"{further}.npz"), _poses(led.truth))
+            placed = {key: np.array([each[key] for each in shown[further]]) for key in (shown[further] or [{}])[0]}
+            truth.write_arrays(str(own / SCANS / f"{further}.npz"), _poses(led.scanned) | placed)
         if film is not None:
             film.finish(capture, truth)
         if probe is not None:
             capture.add_probe(probe)
+
+
+def _poses(track: Track) -> dict[str, NDArray]:
+    return {"times_ns": track.times, "world_from_target": track.poses}
 
 
 def _describe_sound(scene: Scene, body: Body) -> dict[str, object]:

@@ -27,7 +27,7 @@ from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
-ALONG_MM = 0.04  # between points of a shaft's line: 2.4 rad of phase both ways where it is steepest
+ALONG = 1 / 5  # wavelengths between points of a shaft's line: 2.5 rad of phase both ways where it is steepest
 TAPS, PLACES = 12, 64  # of the filter between lines, and places between two lines that it is tabled for
 FILTER_EDGE, FILTER_BETA = 0.5, 5.65  # cycles a line, in the middle of its slope from 0.35 to 0.65; Kaiser's, for -60 dB
 FAINTEST = 2e-3  # of the strongest sample of a shaft's echo, where it ends
@@ -56,20 +56,21 @@ class Tool:
 class _Line(NamedTuple):
     """A shaft's axis in the face's frame, for compiled code."""
 
-    first: Array  # (3,) mm, its middle end, where the tip begins
+    first: Array  # (3,) mm, where the tip begins
     back: Array  # (3,) unit, from there to the rear
     count: int
     step_mm: float
     radius: float
-    smooth: Array  # (count,) amplitude that roughness leaves, square to the beam; its logarithm over cos² of the tilt
+    smooth: Array  # (count,) logarithm of the amplitude that roughness leaves, square to the beam
     echo: NDArray[np.complex64]  # (tilts, n) mm
     last: NDArray[np.int64]  # (tilts,) samples that count
     bounce: float  # of amplitude at its front
 
 
 class _Surface(NamedTuple):
-    """Facets in the face's frame, for compiled code."""
+    """Facets for compiled code, as of `tool_surface.Facets`."""
 
+    pose: Array  # (4, 4) of their frame in the face's
     place: Array
     normal: Array
     area: Array
@@ -92,25 +93,23 @@ def tool_echoes(tool: Tool, body: Body, transducer: Transducer, beam: Beam, path
 
 def _line(shaft: Shaft, around: Tissue, transducer: Transducer, scanner: Scanner) -> _Line:
     """The whole cylinder behind the tip."""
-    form = form_of(shaft)
-    blunt = blunt_mm(form)
-    length = max(min(shaft.length, SEEN_MM) - blunt, 0.0)
-    count = int(length / ALONG_MM)
-    behind = blunt + ALONG_MM * (np.arange(count) + 0.5)
+    blunt, step = blunt_mm(form_of(shaft, transducer.wavelength_mm)), ALONG * transducer.wavelength_mm
+    count = int(max(min(shaft.length, SEEN_MM) - blunt, 0.0) / step)
+    behind = blunt + step * (np.arange(count) + 0.5)
     rough = np.where(behind < shaft.etched, shaft.etched_roughness, shaft.material.roughness)
     echo = resonance(layers_of(shaft, around, transducer, scanner.sample_mm))
     smooth = -0.5 * (2 * scanner.wavenumber * rough) ** 2
     first = shaft.ends[1] - blunt * shaft.along
     loud = np.abs(echo) > FAINTEST * np.abs(echo).max()
     last = echo.shape[1] - loud[:, ::-1].argmax(axis=1)
-    return _Line(first, -shaft.along, count, ALONG_MM, shaft.radius, smooth, echo, last, _bounce(shaft, around))
+    return _Line(first, -shaft.along, count, step, shaft.radius, smooth, echo, last, _bounce(shaft, around))
 
 
 def layers_of(shaft: Shaft, around: Tissue, transducer: Transducer, step_mm: float) -> Layers:
     """A shaft in a medium, as its echo depends on it."""
-    filling = shaft.filling or around
-    media = (_medium(each, transducer) for each in (around, shaft.material, filling))
-    return Layers(shaft.radius, shaft.bore, *media, transducer.wavenumber, transducer.assumed_speed, step_mm)
+    outside, wall, filling = (_medium(each, transducer) for each in (around, shaft.material, shaft.filling or around))
+    sound = transducer.wavenumber, transducer.assumed_speed
+    return Layers(shaft.radius, shaft.bore, outside, wall, filling, *sound, step_mm)
 
 
 def _medium(tissue: Tissue, transducer: Transducer) -> tuple[float, float, float]:
@@ -122,10 +121,8 @@ def _bounce(shaft: Shaft, around: Tissue) -> float:
 
 
 def _surface(shaft: Shaft, around: Tissue, transducer: Transducer) -> _Surface:
-    found, pose = facets(form_of(shaft)), frame_of(shaft)
-    places, normals = rigid.apply(pose, found.place), rigid.rotate(pose, found.normal)
     wavelength = transducer.wavelength_mm * around.speed / transducer.assumed_speed
-    return _Surface(places, normals, *found[2:], _bounce(shaft, around), wavelength)
+    return _Surface(frame_of(shaft), *facets(form_of(shaft, transducer.wavelength_mm)), _bounce(shaft, around), wavelength)
 
 
 def _between_lines() -> NDArray[np.float32]:
@@ -235,15 +232,22 @@ def _lay_facets(field, tool, between, scanner, beam, paths):
     lines, depths = paths.labels.shape
     pad = (len(field) - lines) // 2
     deepest, k = paths.step_mm * (depths - 2), scanner.wavenumber
+    pose = tool.pose
     for n in range(len(tool.area)):
-        along, depth = on_lines(tool.place[n, 0], tool.place[n, 1], scanner.bend, scanner.middle_mm)
+        a, b, c = tool.place[n]
+        x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
+        y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
+        z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+        along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
         if not (0 < depth < deepest):
             continue
         angle = (along - scanner.middle_mm) * scanner.bend
-        cosine = -(tool.normal[n, 0] * np.sin(angle) + tool.normal[n, 1] * np.cos(angle))
+        a, b, c = tool.normal[n]
+        nx, ny = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c, pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c
+        cosine = -(nx * np.sin(angle) + ny * np.cos(angle))
         if cosine <= 0:
             continue
-        weight = _across(beam, depth, tool.place[n, 2]) * _fade(depth)
+        weight = _across(beam, depth, z) * _fade(depth)
         if abs(weight) < 1e-9:
             continue
         line = min(max(int(along / scanner.line_mm + 0.5), 0), lines - 1)

@@ -29,8 +29,8 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-LINES, LEVELS = 3, 4  # lines and levels of depth from one place where shadows are summed to the next
-POINTS = 16, 6  # of the aperture, along and across the array
+LINES, LEVELS = 4, 5  # lines and levels of depth from one place where shadows are summed to the next
+POINTS = 10, 6  # of the aperture, along and across the array
 BESIDE = 6.0  # widths of Fresnel's zone beside a rod, from where it hides nothing
 FURTHEST, STEP = 12.0, 0.01  # of the table of Fresnel's integral
 _TIMES = np.arange(0, FURTHEST + 2 * STEP, STEP)

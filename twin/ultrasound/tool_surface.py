@@ -4,6 +4,7 @@ The whole cylinder behind the tip is left to the series of `tool_resonance`, as 
 comes from patches all over it, each with a phase of its own, which belongs to the tool and moves with it.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -14,8 +15,8 @@ from scenes.handheld.shaft import Shaft
 
 Array = NDArray[np.float64]
 
-FACET_MM = 0.025  # side of a facet: 1.5 rad of phase both ways, at 7.5 MHz
-PATCH_MM = 0.1  # side of a rough patch, about half a wavelength
+FACET = 1 / 8  # side of a facet in wavelengths: 1.6 rad of phase both ways
+PATCH = 1 / 2  # of a rough patch
 SEEN_MM = 90.0  # of a shaft from its tip, at most
 SEED = 5  # of the phases of patches
 
@@ -32,7 +33,7 @@ class Facets(NamedTuple):
 
 
 class Form(NamedTuple):
-    """What a tool's surface depends on."""
+    """Shape of a tool, and the length of the waves that its surface is cut into facets for."""
 
     kind: str
     radius: float
@@ -43,12 +44,13 @@ class Form(NamedTuple):
     roughness: float
     etched: float
     etched_roughness: float
+    wavelength: float  # mm
 
 
-def form_of(shaft: Shaft) -> Form:
+def form_of(shaft: Shaft, wavelength_mm: float) -> Form:
     """The form of a shaft, by which its facets are kept."""
     rough = shaft.material.roughness, shaft.etched, shaft.etched_roughness
-    return Form(shaft.kind, shaft.radius, shaft.bore, float(shaft.angle), shaft.ball, shaft.length, *rough)
+    return Form(shaft.kind, shaft.radius, shaft.bore, float(shaft.angle), shaft.ball, shaft.length, *rough, wavelength_mm)
 
 
 def frame_of(shaft: Shaft) -> Array:
@@ -76,15 +78,15 @@ Surface = tuple[Array, Array, Array]  # places, normals, areas
 
 def _bevel(form: Form) -> Surface:
     """The cut wall, and the outer wall beside it: the cut leads from the point at x = -radius up to the heel at x = radius."""
-    a, slope = form.radius, 1 / np.tan(form.angle)
-    count = int(np.ceil(2 * np.pi * a / FACET_MM))
+    a, slope, side = form.radius, 1 / np.tan(form.angle), FACET * form.wavelength
+    count = int(np.ceil(2 * np.pi * a / side))
     turn = 2 * np.pi * (np.arange(count) + 0.5) / count
     out = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(count)])
     seam, cut = -2 * a * slope, -a * (1 + out[:, 0]) * slope
-    wall = [_strip(out[k], a, cut[k], seam, 2 * np.pi * a / count) for k in range(count)]
-    rings = int(np.ceil((a - form.bore) / FACET_MM))
+    wall = [_strip(out[k], a, cut[k], seam, 2 * np.pi * a / count, side) for k in range(count)]
+    rings = int(np.ceil((a - form.bore) / side))
     edges = np.linspace(form.bore, a, rings + 1)
-    middles, fine = (edges[1:] + edges[:-1]) / 2, int(np.ceil(2 * np.pi * a / np.sin(form.angle) / FACET_MM))
+    middles, fine = (edges[1:] + edges[:-1]) / 2, int(np.ceil(2 * np.pi * a / np.sin(form.angle) / side))
     turn = 2 * np.pi * (np.arange(fine) + 0.5) / fine
     radius, turn = (each.ravel() for each in np.meshgrid(middles, turn, indexing="ij"))
     x, y = radius * np.cos(turn), radius * np.sin(turn)
@@ -94,9 +96,9 @@ def _bevel(form: Form) -> Surface:
     return _joined([*wall, (face, normal, area)])
 
 
-def _strip(out: Array, radius: float, first: float, last: float, width: float) -> Surface:
+def _strip(out: Array, radius: float, first: float, last: float, width: float, side: float) -> Surface:
     """Facets down a cylinder's wall, of which one direction : (3,) leads out, from one height to a lower one."""
-    count = int(np.ceil((first - last) / FACET_MM))
+    count = int(np.ceil((first - last) / side))
     heights = first + (last - first) * (np.arange(count) + 0.5) / max(count, 1)
     places = radius * out + np.outer(heights, [0.0, 0.0, 1.0])
     return places, np.tile(out, (count, 1)), np.full(count, width * (first - last) / max(count, 1))
@@ -104,26 +106,26 @@ def _strip(out: Array, radius: float, first: float, last: float, width: float) -
 
 def _cone(form: Form) -> Surface:
     """The side of a cone."""
-    slant = form.radius / np.sin(form.angle)
-    return _turned(np.linspace(0, slant, int(np.ceil(slant / FACET_MM)) + 1), lambda s: (
+    slant, side = form.radius / np.sin(form.angle), FACET * form.wavelength
+    return _turned(np.linspace(0, slant, int(np.ceil(slant / side)) + 1), side, lambda s: (
         s * np.sin(form.angle), -s * np.cos(form.angle), np.cos(form.angle), np.sin(form.angle)
     ))  # fmt: skip
 
 
 def _ball(form: Form) -> Surface:
     """A ball, but where the shaft leaves it."""
-    r = form.ball
+    r, side = form.ball, FACET * form.wavelength
     last = np.pi - np.arcsin(min(form.radius / r, 1.0))
-    steps = np.linspace(0, last * r, int(np.ceil(last * r / FACET_MM)) + 1)
-    return _turned(steps, lambda s: (r * np.sin(s / r), r * (np.cos(s / r) - 1), np.sin(s / r), np.cos(s / r)))
+    steps = np.linspace(0, last * r, int(np.ceil(last * r / side)) + 1)
+    return _turned(steps, side, lambda s: (r * np.sin(s / r), r * (np.cos(s / r) - 1), np.sin(s / r), np.cos(s / r)))
 
 
-def _turned(steps: Array, at) -> Surface:
-    """A body of revolution: `at` gives radius, height, and outward normal along them, for lengths along its outline."""
+def _turned(steps: Array, side: float, at: Callable[[float], tuple[float, float, float, float]]) -> Surface:
+    """A body of revolution: `at` gives radius, height, and the normal in these directions, for a length along its outline."""
     parts = []
     for s, width in zip((steps[1:] + steps[:-1]) / 2, np.diff(steps), strict=True):
         radius, height, outward, onward = at(s)
-        count = max(int(np.ceil(2 * np.pi * radius / FACET_MM)), 4)
+        count = max(int(np.ceil(2 * np.pi * radius / side)), 4)
         turn = 2 * np.pi * (np.arange(count) + 0.5) / count
         out = np.column_stack([np.cos(turn), np.sin(turn)])
         places = np.column_stack([radius * out, np.full(count, height)])
@@ -134,13 +136,13 @@ def _turned(steps: Array, at) -> Surface:
 
 def _patches(form: Form) -> Surface:
     """Patches all over the whole cylinder."""
-    first = -blunt_mm(form)
-    last, count = -min(form.length, SEEN_MM), max(int(np.ceil(2 * np.pi * form.radius / PATCH_MM)), 6)
-    heights = np.arange(first - PATCH_MM / 2, last, -PATCH_MM)
+    first, side = -blunt_mm(form), PATCH * form.wavelength
+    last, count = -min(form.length, SEEN_MM), max(int(np.ceil(2 * np.pi * form.radius / side)), 6)
+    heights = np.arange(first - side / 2, last, -side)
     turn = 2 * np.pi * (np.arange(count) + 0.5) / count
     out = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(count)])
     places = (form.radius * out[None] + heights[:, None, None] * [0.0, 0.0, 1.0]).reshape(-1, 3)
-    area = np.full(len(places), PATCH_MM * 2 * np.pi * form.radius / count)
+    area = np.full(len(places), side * 2 * np.pi * form.radius / count)
     return places, np.tile(out, (len(heights), 1)), area
 
 

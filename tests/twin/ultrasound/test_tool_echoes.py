@@ -83,7 +83,7 @@ def cut_end(shaft: Shaft, length: float, step: float) -> Surface:
 
 def huygens(array: Transducer, shaft: Shaft, line_mm: float, depths: np.ndarray) -> np.ndarray:
     """Envelope at depths : (n,) on a line, of Kirchhoff's integral over the surface of a hard rod, with no raster between."""
-    points, normals, areas = (cut_end if shaft.kind == "bevel" else round_end)(shaft, 16.0, 0.02)
+    points, normals, areas = (cut_end if shaft.kind == "bevel" else round_end)(shaft, 12.0, 0.02)
     x, y, z = points.T
     cosine = -normals[:, 1]
     kept = (cosine > 0) & (np.abs(x - line_mm) < 3.9) & (np.abs(z) < 3.5) & (y > 8)

@@ -15,7 +15,7 @@ from twin.ultrasound.tool_shadow import shaded
 from twin.ultrasound.transducer import Transducer
 
 ROD = 15.0  # mm, depth of a rod's axis
-STEP = 0.005
+STEP = 0.01
 
 
 def one_way(array: Transducer, apodised: bool, width: float, focus: float, depth: float, radius: float, beside: float) -> complex:
