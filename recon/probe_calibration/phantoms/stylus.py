@@ -23,7 +23,7 @@ from recon.probe_calibration import movement, needle_echo, point_calibration
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.needle_echo import NeedleEcho
 from recon.probe_calibration.phantom_frames import PhantomFrames
-from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Noise, Sightings
+from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Sightings
 from recon.probe_calibration.tank_calibration import Settings
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> Sty
     """
     sightings: Sightings = frames.sightings
     if sightings.pose_covariance is None:
-        sightings = replace(sightings, pose_covariance=_of_both(sightings.poses, settings.noise))
+        sightings = replace(sightings, pose_covariance=settings.noise.from_body(sightings.poses))
     tip: Tip | None = frames.known
     if tip is None:
         return _adjust(frames, sightings, settings, expected, None)
@@ -138,13 +138,6 @@ def _adjust(
     held_out = float(np.sqrt(np.mean(np.concatenate(away) ** 2)))
     values = {each.name: getattr(found, each.name) for each in fields(found)}
     return StylusAdjustment(**values, held_out_mm=held_out)
-
-
-def _of_both(poses: Array, noise: Noise) -> Array:
-    """Covariance : (n, 6, 6) of poses in the frame of a body that is tracked with the same noise as the target."""
-    by_body = np.tile(-np.eye(6), (len(poses), 1, 1))
-    by_body[:, 3:, :3] = rigid.cross(poses[:, :3, 3])
-    return noise.of_pose + propagate(by_body, noise.of_pose)
 
 
 def _in_frame(sightings: Sightings, to_from: Array) -> Sightings:

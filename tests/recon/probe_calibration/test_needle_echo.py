@@ -5,7 +5,7 @@ import pytest
 
 from recon.probe_calibration import needle_echo
 from recon.probe_calibration.needle_echo import Expected
-from tests.recon import bscans
+from tests.recon import bscans, needle_scans
 from tests.recon.needle_scans import SCALE, echo_of, image, rod
 
 TIP = np.array([22.0, 28.0, 0.0])  # mm, in the image's frame
@@ -96,3 +96,10 @@ def test_a_part_of_an_image_is_shifted_back():
     scan = image("water", rod(TIP, 25.0))
     whole, part = needle_echo.find(scan), needle_echo.find(scan[30:, 40:]).shifted((40, 30))
     assert np.linalg.norm(whole.pixel - part.pixel) < 0.3 and np.linalg.norm(whole.shaft[1] - part.shaft[1]) < 0.3
+
+
+@pytest.mark.parametrize("dip_deg", [25.0, 35.0])
+def test_the_point_of_a_bevel_is_found_aside_from_the_shafts_line(dip_deg):
+    """It lies on the wall, a radius beside the axis, and shines by what it diffracts."""
+    found = needle_echo.find(needle_scans.bevelled(TIP, dip_deg))
+    near(found, np.array([TIP[0], TIP[1] * 1540 / 1488.3]) / SCALE, 0.3)
