@@ -184,7 +184,10 @@ def compare(
     seen = Seen(
         np.array([tips[k].pixel for k in used]),
         np.array([tips[k].covariance for k in used]),
-        *(each[used] for each in (poses, covariance, alike, rates)),
+        poses[used],
+        covariance[used],
+        alike[used],
+        rates[used],
         settings.tip_radius_mm,
         settings.tip_radius_sigma_mm,
         settings.lag_sigma_s,
