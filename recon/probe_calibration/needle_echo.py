@@ -41,6 +41,7 @@ GAP_PX = 25.0  # in a shaft, at most
 BORDER_PX = 6.0  # from the image's sides and the face, within which a shaft may go on
 RIVAL = 0.6  # of the strongest shaft's weight, from which on another one makes the image ambiguous
 NEAR_PX, SIGMAS = 60.0, 3.0  # from the expected tip, within which one is taken, with its standard deviations
+FAR = "no tip near where tracking has it"  # reason of a rejection
 HALF_DB = 6.0  # below the shaft's level, at the tip: half of the amplitude
 LEVEL_PX = (8, 40)  # before the end, between which the shaft's level is taken
 FADE_DB, FADE_PX = 15.0, 17.0  # beyond the tip the echo falls by this within this way; a slower one fades out of the plane
@@ -142,7 +143,7 @@ def find(image: NDArray, appearance: Appearance | None = None, expected: Expecte
     if expected is not None:
         near = [k for k, one in enumerate(tips) if _off(shafts[ending[k]], one, expected) < 1]
         if not near:
-            return _none("no tip near where tracking has it", strongest)
+            return _none(FAR, strongest)
         tips, ending = [tips[k] for k in near], [ending[k] for k in near]
     if len(tips) > 1 and shafts[ending[1]].weight > RIVAL * shafts[ending[0]].weight:
         places = ", ".join(f"({u:.0f}, {v:.0f})" for u, v in (shafts[k].ends.mean(axis=0) for k in ending[:2]))
@@ -224,9 +225,8 @@ def _shaft(relief: NDArray[np.float32], least: float, line: _Line) -> _Shaft | N
     if end - begin < SHORTEST_PX:
         return None
     rows = _followed(strip, begin, end, least)
-    levels = strip[np.clip(rows[None] + np.arange(-CORE_PX, CORE_PX + 1)[:, None], 0, len(strip) - 1), np.arange(len(rows))].max(
-        axis=0
-    )
+    beside = np.clip(rows + np.arange(-CORE_PX, CORE_PX + 1)[:, None], 0, len(strip) - 1)
+    levels = strip[beside, np.arange(len(rows))].max(axis=0)
     levels[begin:end] = np.maximum(levels[begin:end], core[begin:end])
     longest = max(_runs(levels > max(least, core.max() - EVEN_DB)), key=lambda run: min(run[1], end) - max(run[0], begin))
     return _Shaft(line, sigma, levels, first, across[rows], *longest)

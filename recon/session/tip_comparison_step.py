@@ -40,6 +40,11 @@ HEADER = (
 )
 BESIDE = "out of the plane by tracking"  # kind of a reason
 LEAST = 5  # B-scans with a tip
+WAYS = {
+    needle_echo.FAR: "another tool's tip.yaml, another probe's calibration, or clocks that differ? measure-lag finds lag_s",
+    BESIDE: "lead the tip in the image's plane, or give beside_mm",
+    "no echo stands out": "another scanner? give appearance.min_contrast_db",
+}
 CAUSES: Mapping[str, tuple[str, str]] = {  # of faults: what is off, and the likely cause
     TOOL: ("the tip lies {mm:.2f} mm elsewhere in the tool's frame", "a bent shaft, a target that slipped, or another tip.yaml"),
     PROBE: ("the probe lies {mm:.2f} mm elsewhere in its target's frame", "a bracket that moved since its calibration"),
@@ -117,8 +122,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> int:
     probe = sound_in_water.for_tissue(_probe(settings, sweep), settings.tissue_m_s)
     found = compare(sweep, probe, tip, settings, watch)
     figures = measure(found.comparison, len(found.numbers))
-    lines = list(describe(found, figures))
-    for line in lines:
+    for line in describe(found, figures):
         watch.say(line)
     with atomic.new_folder(out, BY) as folder:
         sweep_tables.write_rows(folder / FRAMES, HEADER, rows(found, probe))
@@ -177,7 +181,8 @@ def compare(
     used = np.flatnonzero([one.found for one in tips])
     if len(used) < LEAST:
         reason, count = Counter(one.reason.partition(":")[0] for one in tips if one.reason).most_common(1)[0]
-        found = f"found {len(used)} (most often: {reason}, {count} of {len(tips)})"
+        way = f"; {WAYS[reason]}" if reason in WAYS else ""
+        found = f"found {len(used)} (most often: {reason}, {count} of {len(tips)}{way})"
         raise InputError(f"{sweep.name}: expected {LEAST} B-scans or more with a pose and the tip, {found}")
     rates = tracks.rates_at(sweep.track, sweep.times, lag) if sweep.clocked else np.zeros((len(poses), 4, 4))
     alike = np.zeros((len(poses), 6, 6)) if shared is None else shared

@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 CHANCE = 1e-3  # of a fault as large by what is left open, below which it is named
 LIKE = 6.0  # of Schwarz's criterion, within which another fault may be it as well
 TOOL, PROBE, SOUND, LATE = "tool", "probe", "sound", "late"  # faults
-SIZES = {TOOL: 3, PROBE: 6, SOUND: 1, LATE: 1}  # numbers of each
 
 
 class Seen(NamedTuple):

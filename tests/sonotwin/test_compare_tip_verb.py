@@ -24,7 +24,7 @@ from tests.recon import needle_scans, stylus_motions, sweep_sets
 from tests.recon.probe_motions import true_probe
 from tests.recon.stylus_motions import TIP, TIP_MM
 
-COUNT, APART_S = 30, 0.05
+COUNT, APART_S = 20, 0.05
 WATER = ("tissue_m_s=1488.3", f"tip_radius_mm={needle_scans.RADIUS_MM}")
 SIGMA = np.array([2e-5, 2e-5, *np.radians([0.05] * 3), 0.05, 0.05, 0.05])  # of the probe's calibration, as NAMES
 
@@ -73,6 +73,7 @@ def recording(tmp_path_factory, rig) -> Path:
     tip = Tip(TIP, TIP_MM**2 * np.eye(3), body="needle")
     tip_files.write(folder / "tip.yaml", tip)
     tip_files.write(folder / "bent.yaml", replace(tip, tip_mm=TIP + np.array([0, 2.0, 0])))
+    tip_files.write(folder / "far.yaml", replace(tip, tip_mm=TIP + np.array([0, 40.0, 0])))
     tip_files.write(folder / "stylus.yaml", replace(tip, body="stylus"))
     return folder
 
@@ -114,6 +115,7 @@ def test_what_is_off_is_named_with_its_cause(given, said, recording, tmp_path, m
     (("tip=tip.yaml",), "expected capture or sequence, found neither"),
     (("capture=capture", "tip=tip.yaml", "beside_mm=0.001"), "expected 5 B-scans or more with a pose and the tip, found 0"),
     (("capture=capture", "tip=tip.yaml", "beside_mm=-1"), "beside_mm"),
+    (("capture=capture", "tip=far.yaml", "beside_mm=50"), "no tip near where tracking has it, 20 of 20; another tool's tip.yaml"),
 ])  # fmt: skip
 def test_mistakes_are_named_and_nothing_is_written(given, said, recording, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(recording)

@@ -17,6 +17,7 @@ def near(found, pixel, mm):
     assert np.linalg.norm((found.pixel - pixel) * SCALE) < mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("medium", ["water", "gelatin", "silicone"])
 def test_tips_are_found_to_a_quarter_of_a_millimetre(medium):
     """Half of 24 needles at all angles within 0.2 mm, 95 % within 0.6 mm, with a covariance that has them: chi-square, 2."""
@@ -40,6 +41,12 @@ def test_what_is_expected_moves_no_tip():
     for off in ([3 * MM_PX, 0], [0, -3 * MM_PX]):
         expected = Expected(pixel + off, 0.1 * np.eye(2), np.array([0.8, 0.6]))
         assert np.array_equal(needle_echo.find(scan, None, expected).pixel, alone.pixel)
+
+
+def test_what_ends_far_from_where_tracking_has_the_tip_is_none():
+    """Such as skin, or another needle: 15 mm off, beyond what poses and calibrations leave open."""
+    expected = Expected(echo_of(TIP, "water") + np.array([0, 15 * MM_PX]), np.eye(2))
+    assert needle_echo.find(image("water", rod(TIP, 30.0)), None, expected).reason == needle_echo.FAR
 
 
 def test_what_is_expected_chooses_among_needles():
