@@ -33,6 +33,8 @@ MADE = (  # command lines in the order in which they are run
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
     ("sweep", "path=raster", "out=raster"),
+    ("sweep", "rig=three_bodies", "scene=tank", "ultrasound=water", "path=hold", "path.surface=tank", "path.standoff_mm=40",
+     "bodies.needle.path={kind: insertion, rest_s: 5}", "clocks.scanner_hz=2", "out=needle"),
     ("sweep", *STROKE, "filmed=true", "clocks.camera_hz=20", "out=filmed"),
     ("film", "frames=24", "path.turn_deg=20", "white_dn=120", "seed=1", "out=film"),
     ("dataset", "samples=4", "shard=2", "out=data"),
@@ -118,6 +120,10 @@ COMMANDS = (
             ("sphere",), _sweep("sphere")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
+    Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),
+            ("needle", "needle_tip.yaml"),
+            (*_sweep("needle"), "needle/capture/calibration/probe.yaml", "needle/capture/sweep/bodies/needle/poses.csv",
+             "needle_tip.yaml")),
     Command("measure-lag", ("capture=bottom/capture",), ("bottom",), _sweep("bottom")),
     Command("track", ("capture=film/capture", "target=target/target.yaml", "networks=networks"),
             ("film", "target", "networks"),
@@ -311,6 +317,8 @@ def _write_tool(folder: Path) -> None:
     mesh = trimesh.creation.cone(1.0, length, sections=6).apply_transform(np.diag([1.0, -1, -1, 1]))
     for suffix in (".stl", ".glb"):
         mesh.export(folder / f"needle{suffix}")
+    drawn = np.array([12.0, -111.463, -155.128])  # of `scenes.handheld.looks.needle`, in its target's frame
+    tip_files.write(folder / "needle_tip.yaml", Tip(drawn, np.eye(3), body="needle"))
     tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis, body="needle"))
 
 

@@ -46,7 +46,7 @@ class SweepCapture:
         if name not in self.bodies:
             there = ", ".join(self.bodies) or "none: `sonotwin track` finds those of rig.bodies"
             raise InputError(
-                f"{self.name}: body: expected one of those tracked, {there}; found {name}{did_you_mean(name, self.bodies)}"
+                f"{self.name}: body: expected one of those tracked, {there}; found {name}{did_you_mean(name, list(self.bodies))}"
             )
         return replace(self, track=tracks.from_body(self.track, self.bodies[name]))
 

@@ -2,10 +2,12 @@
 
 Seen along its length, a shaft is a bright line with echoes from within behind it, and the tip is the line's end inside the image.
 The line comes from Hough's transform and a robust fit to its first echoes. Blurred by the beam, the line falls off evenly about
-its end, so that the amplitude there is half of the shaft's. A shaft that leaves the image's plane fades over a longer way: its
-end isn't the tip, and is rejected. Where the shaft crosses the plane it is a spot, found as crossed wires are.
+its end, so that the amplitude there is half of the shaft's. A bevel goes on aside from the shaft, and its tip is a spot. A shaft
+that leaves the image's plane fades over a longer way: its end isn't the tip, and is rejected. Where the shaft crosses the plane
+it is a spot, found as crossed wires are.
 
-A pose by tracking may say roughly where the tip is. It chooses among lines and between a line's ends, and moves neither.
+A pose by tracking may say roughly where the tip is. It chooses among lines and between a line's ends, and moves neither; lines
+that end elsewhere, such as skin, are none then.
 """
 
 from dataclasses import dataclass, replace
@@ -23,11 +25,14 @@ Array = NDArray[np.float64]
 
 STEEPEST = 72.0  # deg, of a shaft to the array; steeper lines are comet tails
 ANGLES = np.radians(np.arange(-STEEPEST, STEEPEST + 2, 2.0))  # of lines, from the array's direction down
+FACE_ROWS, DEPTH_ROWS = 60, 81  # to which the face's ringing reaches; over which the background changes deeper down
 BIN_PX = 3.0  # of a line's offset
 NOISE = 4.0  # least height of a shaft's echo, in units of the noise
 CEILING_DB = 20.0  # above the least height, beyond which brightness counts no more: lines count by their length
 LINES = 5  # looked at, the strongest
 ABOVE_PX, BELOW_PX = 15.0, 60.0  # from a line: echoes there are its own
+BEVEL_PX = 60  # before a straight run's end, from where on its end may turn
+ASIDE_PX, TURN_PX = 60, 2  # from a line, to where its end may turn, as a bevel does, and by how much from column to column
 STRIP_PX, CORE_PX = 12, 5  # to both sides of a line: its first echoes, and those that are its level
 FRONT_DB = 8.0  # below the strongest of a column, that the first echo may be
 EVEN_DB = 22.0  # below its strongest, within which a shaft's echo lies: a spot's side lobes don't
@@ -35,10 +40,12 @@ SHORTEST_PX = 40.0  # of a shaft that is a line: 5 mm
 GAP_PX = 25.0  # in a shaft, at most
 BORDER_PX = 6.0  # from the image's sides and the face, within which a shaft may go on
 RIVAL = 0.6  # of the strongest shaft's weight, from which on another one makes the image ambiguous
-NEAR_PX, SIGMAS = 60.0, 3.0  # from the expected tip, within which a tip is preferred, with its standard deviations
+NEAR_PX, SIGMAS = 60.0, 3.0  # from the expected tip, within which one is taken, with its standard deviations
+FAR = "no tip near where tracking has it"  # reason of a rejection
 HALF_DB = 6.0  # below the shaft's level, at the tip: half of the amplitude
 LEVEL_PX = (8, 40)  # before the end, between which the shaft's level is taken
-FADE_DB, FADE_PX = 15.0, 14.0  # beyond the tip the echo falls by this within this way; a slower one fades out of the plane
+FADE_DB, FADE_PX = 15.0, 17.0  # beyond the tip the echo falls by this within this way; a slower one fades out of the plane
+SPOT_PX = 8  # before the end of a bevel, where the spot of its tip is
 EDGE_PX = 5.0  # such a way of an even shaft
 OUTSIDE_DB = -1e3
 GRAIN_PX = 5.0  # length with one independent level
@@ -95,6 +102,7 @@ class _Shaft:
     sigma_px: float  # of the line, across
     levels: Array  # (n,) dB along the line, a px
     first_px: float  # place of the first level from the line's point
+    aside_px: Array  # (n,) of the echo from the line, towards the probe: beyond the straight run it may turn
     begin: int  # of the run, in the levels
     end: int
 
@@ -110,7 +118,8 @@ class _Shaft:
 
     def pixel(self, place: float) -> Array:
         """Pixel : (2,) of a place in the levels."""
-        return self.line.point + (self.first_px + place) * self.line.along
+        aside = np.interp(place, np.arange(len(self.aside_px)), self.aside_px)
+        return self.line.point + (self.first_px + place) * self.line.along + aside * self.line.normal
 
 
 def find(image: NDArray, appearance: Appearance | None = None, expected: Expected | None = None) -> NeedleEcho:
@@ -133,7 +142,9 @@ def find(image: NDArray, appearance: Appearance | None = None, expected: Expecte
     tips = [_tip(shafts[k], inside[k], least, strongest, expected) for k in ending]
     if expected is not None:
         near = [k for k, one in enumerate(tips) if _off(shafts[ending[k]], one, expected) < 1]
-        tips, ending = ([each[k] for k in near or range(len(tips))] for each in (tips, ending))
+        if not near:
+            return _none(FAR, strongest)
+        tips, ending = [tips[k] for k in near], [ending[k] for k in near]
     if len(tips) > 1 and shafts[ending[1]].weight > RIVAL * shafts[ending[0]].weight:
         places = ", ".join(f"({u:.0f}, {v:.0f})" for u, v in (shafts[k].ends.mean(axis=0) for k in ending[:2]))
         return _none(f"two candidates: shafts about {places}", strongest)
@@ -143,7 +154,10 @@ def find(image: NDArray, appearance: Appearance | None = None, expected: Expecte
 def _relief(level: NDArray[np.float32], look: Appearance) -> tuple[NDArray[np.float32], float]:
     """Levels above the background, dB : (h, w), smoothed, and the least of an echo."""
     smooth = cv2.GaussianBlur(level, (0, 0), sigmaX=MATCHED_PX[0], sigmaY=MATCHED_PX[1], borderType=cv2.BORDER_REPLICATE)
-    relief = (smooth - np.percentile(smooth, FACE_PERCENT, axis=1, keepdims=True)) / (255 / look.dynamic_range_db)
+    rows = np.percentile(smooth, FACE_PERCENT, axis=1)
+    evenly = ndimage.median_filter(rows, DEPTH_ROWS, mode="nearest")  # a bottom along the array is no background
+    background = np.where(np.arange(len(rows)) < FACE_ROWS, rows, evenly)
+    relief = (smooth - background[:, None]) / (255 / look.dynamic_range_db)
     relief -= np.median(relief)
     relief[: look.top_px] = 0
     return relief.astype(np.float32), max(NOISE * NORMAL_MAD * float(np.median(np.abs(relief))), look.min_contrast_db)
@@ -202,11 +216,37 @@ def _shaft(relief: NDArray[np.float32], least: float, line: _Line) -> _Shaft | N
         line = _Line(line.point + height * line.normal, turned / np.linalg.norm(turned))
     if abs(line.along[1]) > np.sin(np.radians(STEEPEST)):
         return None
-    levels = _sampled(relief, line, along, np.arange(-CORE_PX, CORE_PX + 1.0)).max(axis=0)
-    there = np.flatnonzero(levels > OUTSIDE_DB)
-    levels, first = levels[there[0] : there[-1] + 1], along[there[0]]
-    begin, end = max(_runs(levels > max(least, levels.max() - EVEN_DB)), key=lambda run: run[1] - run[0], default=(0, 0))
-    return _Shaft(line, sigma, levels, float(first), begin, end) if end - begin >= SHORTEST_PX else None
+    across = np.arange(ASIDE_PX, -ASIDE_PX - 1, -1.0)
+    strip = _sampled(relief, line, along, across)
+    core = strip[ASIDE_PX - CORE_PX : ASIDE_PX + CORE_PX + 1].max(axis=0)
+    there = np.flatnonzero(core > OUTSIDE_DB)
+    strip, core, first = strip[:, there[0] : there[-1] + 1], core[there[0] : there[-1] + 1], float(along[there[0]])
+    begin, end = max(_runs(core > max(least, core.max() - EVEN_DB)), key=lambda run: run[1] - run[0], default=(0, 0))
+    if end - begin < SHORTEST_PX:
+        return None
+    rows = _followed(strip, begin, end, least)
+    beside = np.clip(rows + np.arange(-CORE_PX, CORE_PX + 1)[:, None], 0, len(strip) - 1)
+    levels = strip[beside, np.arange(len(rows))].max(axis=0)
+    levels[begin:end] = np.maximum(levels[begin:end], core[begin:end])
+    longest = max(_runs(levels > max(least, core.max() - EVEN_DB)), key=lambda run: min(run[1], end) - max(run[0], begin))
+    return _Shaft(line, sigma, levels, first, across[rows], *longest)
+
+
+def _followed(strip: Array, begin: int, end: int, least: float) -> NDArray[np.intp]:
+    """Rows : (n,) of a strip : (m, n) along which the echo goes on where it leaves the line at its ends, as a bevel's does."""
+    middle = len(strip) // 2
+    rows = np.full(strip.shape[1], middle)
+    for columns in (range(max(end - BEVEL_PX, begin), len(rows)), range(min(begin + BEVEL_PX, end) - 1, -1, -1)):
+        row, course = middle, np.full(len(columns), middle)
+        for k, column in enumerate(columns):
+            low = max(row - TURN_PX, 0)
+            window = strip[low : row + TURN_PX + 1, column]
+            row = low + int(window.argmax()) if window.max() > least else row
+            course[k] = row
+        bright = np.flatnonzero(strip[course, columns] > least)
+        if len(bright) and abs(course[bright[-1]] - middle) > CORE_PX:
+            rows[columns] = course
+    return rows
 
 
 def _sampled(relief: NDArray[np.float32], line: _Line, along: Array, across: Array) -> Array:
@@ -258,7 +298,12 @@ def _tip(shaft: _Shaft, inside: NDArray[np.bool_], least: float, contrast: float
     way = (int(dark.argmax()) + 1 if dark.any() else len(dark)) * FADE_DB / max(half - floor, 1.0)
     if way > FADE_PX:
         return _none(f"fades out over {way:.0f} px: the tip isn't in the image's plane", contrast)
-    place = last + (levels[last] - half) / max(levels[last] - levels[last + 1], 1e-6)
+    aside = shaft.aside_px if forward else shaft.aside_px[::-1]
+    if abs(aside[last]) > CORE_PX:  # the end of a bevel, which is seen by what it diffracts: a spot
+        start = max(last - SPOT_PX, begin)
+        place = float(start + levels[start : last + 1].argmax())
+    else:
+        place = last + (levels[last] - half) / max(levels[last] - levels[last + 1], 1e-6)
     pixel = shaft.pixel(place if forward else len(levels) - 1 - place)
     along = BLUR_PX**2 + (uneven * way / FADE_DB) ** 2 + (max(way - EDGE_PX, 0) / 2) ** 2
     axes = np.stack([shaft.line.along, shaft.line.normal], axis=1)

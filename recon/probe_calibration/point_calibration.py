@@ -82,6 +82,12 @@ class Noise:
         """Covariance : (6, 6) of a pose, rad and mm."""
         return np.diag([np.radians(self.angle_deg) ** 2] * 3 + [self.position_mm**2] * 3)
 
+    def from_body(self, poses: Array) -> Array:
+        """Covariance : (n, 6, 6) of poses : (n, 4, 4) in the frame of a body that is tracked with the same noise."""
+        by_body = np.tile(-np.eye(6), (len(poses), 1, 1))
+        by_body[:, 3:, :3] = rigid.cross(poses[:, :3, 3])
+        return self.of_pose + propagate(by_body, self.of_pose)
+
 
 @dataclass(frozen=True)
 class Sightings:

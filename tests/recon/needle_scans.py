@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenes.acoustics import TISSUES
+from scenes.handheld.shaft import Shaft
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import Body, Wire
+from twin.ultrasound.tool_echoes import Tool
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -35,3 +37,12 @@ def echo_of(tip_mm, medium: str) -> Array:
     """Pixel : (2,) at which the front of a tip is shown."""
     ratio = SCANNERS[medium].assumed_speed / TISSUES[medium].speed
     return np.array([tip_mm[0], (tip_mm[1] - RADIUS_MM) * ratio]) / SCALE
+
+
+def bevelled(tip_mm, dip_deg: float, angle_deg: float = 17.0) -> NDArray[np.uint8]:
+    """The B-scan : (h, w) of a needle with a ground tip in water, from the left, the bevel open to the probe."""
+    dip = np.radians(dip_deg)
+    along, up = np.array([np.cos(dip), np.sin(dip), 0.0]), np.array([np.sin(dip), -np.cos(dip), 0.0])
+    steel = replace(TISSUES["steel"], roughness=0.001)
+    shaft = Shaft(np.asarray(tip_mm), along, up, 60.0, 0.735, steel, kind="bevel", angle=np.radians(angle_deg))
+    return scan(Body(TISSUES["water"], (), ()), WATER, np.eye(4), 0, 0, (Tool(shaft),)).image

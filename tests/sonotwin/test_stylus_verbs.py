@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from recon.capture import probe_files, tip_files
 from recon.capture.manifest import SCANNER, Device
@@ -91,3 +92,44 @@ def test_mistakes_are_named_and_nothing_is_written(given, said, recording, tmp_p
     assert main(["calibrate-probe", *(f"{name}={value}" for name, value in fields.items())]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line and not (tmp_path / "probe").exists()
+
+
+@pytest.fixture(scope="module")
+def late(tmp_path_factory, rig) -> Path:
+    """Stylus and probe led about without rest for 12 s, the B-scans 0.2 s behind the poses."""
+    folder, rng, probe = tmp_path_factory.mktemp("late"), np.random.default_rng(8), true_probe(rig)
+
+    def of(times):
+        pixels = np.column_stack([160 + 110 * np.sin(1.1 * times), 200 + 130 * np.sin(1.7 * times + 1)])
+        turns = np.column_stack([40 * np.sin(0.9 * times), 30 * np.sin(1.3 * times + 0.5), 15 * np.sin(0.7 * times)])
+        held = [rigid.from_rotation_vector([0.2 * np.sin(t), 0.2 * np.cos(t), 0], [20 * np.sin(t), 0, 700]) for t in times]
+        poses = []
+        for pixel, turn, stylus in zip(pixels, turns, held, strict=True):
+            image = Rotation.from_euler("YXZ", turn, degrees=True).as_matrix()
+            target = image @ probe.target_from_image[:3, :3].T
+            place = stylus_motions.TIP - target @ probe.to_target(pixel)
+            poses.append(stylus @ rigid.transform(target, place))
+        return pixels, np.array(poses), np.array(held)
+
+    shown, moments = np.arange(0.5, 12.3, 0.2), np.arange(0, 13, 1 / 30)
+    images = [bscans.image(bscans.spot(pixel) + bscans.face(), rng) for pixel in of(shown)[0]]
+    target, stylus = (stylus_motions.tracked(poses, rng, sweep_sets.nanoseconds(moments)) for poses in of(moments)[1:])
+    with new_capture(folder / "capture", "stylus") as capture:
+        scans, devices = ((SCANNER, image) for image in images), {SCANNER: Device(size=bscans.SIZE)}
+        times = {SCANNER: sweep_sets.nanoseconds(shown + 0.2)}
+        capture.add_sweep(times, scans, devices, target, purpose="probe", bodies={"stylus": stylus})
+    tip_files.write(folder / "tip.yaml", stylus_motions.known_tip(rng))
+    return folder
+
+
+@pytest.mark.slow
+def test_a_lag_of_a_stylus_that_moves_is_named_and_found(late, rig, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(late)
+    fields = ["calibrate-probe", "phantom=stylus", "capture=capture", "body=stylus", "tip=tip.yaml", "tank_speed=1540"]
+    assert main([*fields, "lag_s=0", f"out={tmp_path / 'probe'}"]) == 2
+    assert "with lag_s=0.2" in capsys.readouterr().err
+    assert main([*fields, "lag_s=free", f"out={tmp_path / 'probe'}"]) == 0
+    points, true = repeatability.five_points(bscans.SIZE), true_probe(rig)
+    found = probe_files.read(tmp_path / "probe" / "probe.yaml")
+    assert np.linalg.norm(found.to_target(points) - true.to_target(points), axis=1).max() < 0.3
+    assert json.loads((tmp_path / "probe" / "metrics.json").read_text())["lag_ms"] == pytest.approx(200, abs=5)

@@ -240,9 +240,7 @@ def test_a_patient_who_moved_is_taken_out_of_the_probes_poses(tmp_path):
     fields += ["filmed=true", "name=scan", "moved={turn_deg: [0, 3, 4], shift_mm: [12, 16, 0]}", *small(48, 128)]
     assert main(["sweep", f"out={tmp_path}", *rig, *fields]) == 0
     truth, folder = track_errors.read_truth(tmp_path / "truth", "scan"), tmp_path / "truth" / "sweep" / "scan"
-    step = Moved(turn_deg=(0, 3, 4), shift_mm=(12, 16, 0)).matrix(
-        build_scene(config.load("sweep", ["out=unused"], Config).scene)
-    )
+    step = Moved(turn_deg=(0, 3, 4), shift_mm=(12, 16, 0)).matrix(build_scene(config.load("sweep", ["out=unused"], Config).scene))
     with np.load(folder / "bodies" / "patient.npz") as patient:
         assert (patient["visible"] > 0.99).all()
         first = rigid.invert(step) @ patient["world_from_target"][:1]

@@ -19,16 +19,17 @@ from recon.estimation.covariance import propagate
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
 from recon.model.tip import TIP, Tip
-from recon.probe_calibration import movement, needle_echo, point_calibration
+from recon.probe_calibration import movement, needle_echo, point_calibration, point_phantom
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.needle_echo import NeedleEcho
 from recon.probe_calibration.phantom_frames import PhantomFrames
-from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Noise, Sightings
+from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Sightings
+from recon.probe_calibration.point_phantom import misfit
 from recon.probe_calibration.tank_calibration import Settings
 
 Array = NDArray[np.float64]
 
-__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "read", "sight"]
+__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "misfit", "read", "sight"]
 SHOWS = "tip"
 WAYS = {
     "no echo stands out": "another scanner? give appearance.min_contrast_db",
@@ -62,7 +63,7 @@ def sight(
     pixels = np.array([each.pixel for each in seen]).reshape(-1, 2)
     own = np.array([each.covariance for each in seen]).reshape(-1, 2, 2)
     by_lag = lag_sigma_s * rates if lag_sigma_s and rates is not None else None
-    return Sightings(poses, pixels, covariance, own, pose_by_lag=by_lag)
+    return Sightings(poses, pixels, covariance, own, pose_by_lag=by_lag, pose_rates=rates)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> Sty
     """
     sightings: Sightings = frames.sightings
     if sightings.pose_covariance is None:
-        sightings = replace(sightings, pose_covariance=_of_both(sightings.poses, settings.noise))
+        sightings = replace(sightings, pose_covariance=settings.noise.from_body(sightings.poses))
     tip: Tip | None = frames.known
     if tip is None:
         return _adjust(frames, sightings, settings, expected, None)
@@ -140,21 +141,15 @@ def _adjust(
     return StylusAdjustment(**values, held_out_mm=held_out)
 
 
-def _of_both(poses: Array, noise: Noise) -> Array:
-    """Covariance : (n, 6, 6) of poses in the frame of a body that is tracked with the same noise as the target."""
-    by_body = np.tile(-np.eye(6), (len(poses), 1, 1))
-    by_body[:, 3:, :3] = rigid.cross(poses[:, :3, 3])
-    return noise.of_pose + propagate(by_body, noise.of_pose)
-
-
 def _in_frame(sightings: Sightings, to_from: Array) -> Sightings:
     """The same with poses in another frame."""
     turn = np.kron(np.eye(2), to_from[:3, :3])
     assert sightings.pose_covariance is not None
     turned = rigid.transform(to_from[:3, :3], np.zeros(3))
-    by_lag = None if sightings.pose_by_lag is None else turned @ sightings.pose_by_lag
+    by_lag, rates = (None if each is None else turned @ each for each in (sightings.pose_by_lag, sightings.pose_rates))
     covariance = propagate(turn, sightings.pose_covariance)
-    return replace(sightings, poses=to_from @ sightings.poses, pose_covariance=covariance, pose_by_lag=by_lag)
+    poses = to_from @ sightings.poses
+    return replace(sightings, poses=poses, pose_covariance=covariance, pose_by_lag=by_lag, pose_rates=rates)
 
 
 def _check_tip(off: Array, covariance: Array) -> None:
@@ -168,7 +163,8 @@ def _check_tip(off: Array, covariance: Array) -> None:
 
 def figures(found: StylusAdjustment) -> Metrics:
     """The tip's distance from where it was known to be, or from the stylus' origin, and the error of held-out frames."""
-    return {"tip_off_mm": float(np.linalg.norm(found.wire)), "held_out_rms_mm": found.held_out_mm}
+    own = {"tip_off_mm": float(np.linalg.norm(found.wire)), "held_out_rms_mm": found.held_out_mm}
+    return own | {name: value for name, value in point_phantom.figures(found).items() if name != "wires_apart_mm"}
 
 
 def describe(found: StylusAdjustment, settings: Settings) -> Iterator[str]:
@@ -181,6 +177,8 @@ def describe(found: StylusAdjustment, settings: Settings) -> Iterator[str]:
         yield f"tip         [{place}] ± {sigma:.2f} mm in the stylus' frame, found with the probe; tip= takes it as known"
     else:
         yield f"tip         {np.linalg.norm(found.wire):.3f} mm from where {settings.tip} has it, ± {sigma:.3f} mm"
+    if found.late is not None and found.late.shown:
+        yield f"warning     {found.late.described}"
     if found.moved is not None and found.moved.what == movement.PROBE:
         yield f"warning     {found.moved.described}"
     elif found.moved is not None:

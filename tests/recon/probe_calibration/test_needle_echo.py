@@ -5,7 +5,7 @@ import pytest
 
 from recon.probe_calibration import needle_echo
 from recon.probe_calibration.needle_echo import Expected
-from tests.recon import bscans
+from tests.recon import bscans, needle_scans
 from tests.recon.needle_scans import SCALE, echo_of, image, rod
 
 TIP = np.array([22.0, 28.0, 0.0])  # mm, in the image's frame
@@ -17,6 +17,7 @@ def near(found, pixel, mm):
     assert np.linalg.norm((found.pixel - pixel) * SCALE) < mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("medium", ["water", "gelatin", "silicone"])
 def test_tips_are_found_to_a_quarter_of_a_millimetre(medium):
     """Half of 24 needles at all angles within 0.2 mm, 95 % within 0.6 mm, with a covariance that has them: chi-square, 2."""
@@ -40,6 +41,12 @@ def test_what_is_expected_moves_no_tip():
     for off in ([3 * MM_PX, 0], [0, -3 * MM_PX]):
         expected = Expected(pixel + off, 0.1 * np.eye(2), np.array([0.8, 0.6]))
         assert np.array_equal(needle_echo.find(scan, None, expected).pixel, alone.pixel)
+
+
+def test_what_ends_far_from_where_tracking_has_the_tip_is_none():
+    """Such as skin, or another needle: 15 mm off, beyond what poses and calibrations leave open."""
+    expected = Expected(echo_of(TIP, "water") + np.array([0, 15 * MM_PX]), np.eye(2))
+    assert needle_echo.find(image("water", rod(TIP, 30.0)), None, expected).reason == needle_echo.FAR
 
 
 def test_what_is_expected_chooses_among_needles():
@@ -96,3 +103,10 @@ def test_a_part_of_an_image_is_shifted_back():
     scan = image("water", rod(TIP, 25.0))
     whole, part = needle_echo.find(scan), needle_echo.find(scan[30:, 40:]).shifted((40, 30))
     assert np.linalg.norm(whole.pixel - part.pixel) < 0.3 and np.linalg.norm(whole.shaft[1] - part.shaft[1]) < 0.3
+
+
+@pytest.mark.parametrize("dip_deg", [25.0, 35.0])
+def test_the_point_of_a_bevel_is_found_aside_from_the_shafts_line(dip_deg):
+    """It lies on the wall, a radius beside the axis, and shines by what it diffracts."""
+    found = needle_echo.find(needle_scans.bevelled(TIP, dip_deg))
+    near(found, np.array([TIP[0], TIP[1] * 1540 / 1488.3]) / SCALE, 0.3)
