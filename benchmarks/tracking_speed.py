@@ -13,16 +13,19 @@ from typing import cast
 
 import numpy as np
 
+from recon.model import target_family
 from recon.model.rig import PROBE, Rig
 from recon.tracking import networks as nets
+from recon.tracking.bodies import BodyTracker
 from recon.tracking.networks import Networks
 from recon.tracking.tracker import Tracker
 from scenes.catalogue import build_scene
 from sonotwin.config import load
 from sonotwin.verbs import sweep
+from twin.experiments.bodies_accuracy import SEED, rig_of
 from twin.experiments.experiment_setup import Figures, Setup
-from twin.experiments.tracking_frames import ranges_of, study
-from twin.shooting import Quality
+from twin.experiments.tracking_frames import ranges_of, several, study
+from twin.shooting import FilmQuality, Quality
 from twin.tracking import film_session, scene_frames
 from twin.tracking.mesh_bank import build_bank
 from twin.tracking.rendered_views import render_full, render_views
@@ -53,6 +56,30 @@ def tracked(setup: Setup) -> Figures:
     theirs = cold_seconds(rig, images, eager("detector", "segmenter")) if find_spec("torch") else float("nan")
     times = {"locked_faster": theirs / locked, "cold_faster": theirs / cold}
     return times | {"locked_hz": 1 / locked, "cold_ms": 1e3 * cold, "eager_ms": 1e3 * theirs}
+
+
+def bodies(setup: Setup) -> Figures:
+    """Three bodies locked on, in turn with one alone in the same frames; and live, with one of them away."""
+    rig, known = rig_of(setup), nets.load(by_geometry=True)
+    away = target_family.propose(rig.target, 4)[-1]  # that can be told from those in view
+    cameras = rig.cam1.optics.camera(), rig.cam2.optics.camera()
+    film = several(Setup(rig, frames=few(setup)), SEED, FRAMES, (100.0, 100.0), (0.0, 0.0), FilmQuality())
+    seconds: dict[str, list[float]] = {"three": [], "alone": [], "live": []}
+    for pair in [frames.views for _, frames in film]:
+        designs = {"three": rig.targets, "alone": {PROBE: rig.target}, "live": rig.targets | {"needle": away}}
+        trackers = {
+            name: BodyTracker({body: Tracker(cameras, target, known) for body, target in own.items()}, 0.2 * (name == "live"))
+            for name, own in designs.items()
+        }
+        for k in range(REPEATS * 2):
+            for name, tracker in trackers.items():
+                start = perf_counter()
+                found = tracker.step(*pair, k / 60)
+                if k > 1 and [one.how for one in found.values()].count("predicted") == len(designs[name]) - (name == "live"):
+                    seconds[name].append(perf_counter() - start)
+    three, alone = np.median(seconds["three"]), np.median(seconds["alone"])
+    live = np.quantile(seconds["live"], 0.99)
+    return {"three_hz": float(1 / three), "alone_hz": float(1 / alone), "latest_ms": float(1e3 * live)}
 
 
 def published_shape(setup: Setup) -> Figures:

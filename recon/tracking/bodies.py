@@ -64,6 +64,7 @@ class BodyTracker:
 
     trackers: Mapping[str, Tracker]  # by the body's name, all of the same cameras and networks
     search_s: float = 0.0  # live: least time from one search to the next, of which a pair takes a part, while a body is followed
+    further: bool = True  # whether further bodies of the designs are looked for, now and then, while all bodies are followed
     _search: _Search | None = field(default=None, init=False)  # that goes on
     _searched: float | None = field(default=None, init=False)  # when the last one began
     _looked: float | None = field(default=None, init=False)  # when further bodies of the designs were looked for
@@ -126,7 +127,7 @@ class BodyTracker:
 
     def _search_is_due(self, found: Mapping[str, Tracking], moment: Moment, in_parts: bool) -> bool:
         """Whether to begin a search: for what is lost, or now and then for further bodies of the designs."""
-        look = self._looked is None or not 0 <= moment.now - self._looked < moment.look
+        look = self.further and (self._looked is None or not 0 <= moment.now - self._looked < moment.look)
         waiting = in_parts and self._searched is not None and 0 <= moment.now - self._searched < self.search_s
         if not look and (waiting or len(found) == len(self.trackers)):
             return False

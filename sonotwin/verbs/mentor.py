@@ -60,7 +60,6 @@ LOG, LIT = "log.jsonl", "lit.png"
 LOOK_S = 0.2  # between two looks whether all goes on
 WRITE_S = 0.5  # between two pictures that are written in place of a projector
 MOST_VISITORS = 4 * mentor_site.MOST_CLIENTS  # connections at once: a page asks for several things
-SEARCH_S = 1.0  # between searches for further bodies while the patient is followed; each pair takes a part of one
 
 Mentor = Annotated[str, StringConstraints(pattern=r"^[\w.-]{1,40}$")]
 
@@ -245,8 +244,8 @@ def still_curves(config: Config, skin: trimesh.Trimesh, projector: Camera) -> li
 def follower(config: Config, known: Calibration, bits: int) -> Follow:
     """Where the patient carries the skin."""
     cameras = known.cameras[CAMERAS[0]], known.cameras[CAMERAS[1]]
-    tracker = make_body_tracker(config, targets_of(config), cameras, known.uncertainty, bits if bits > 8 else None, SEARCH_S)
-    alone = BodyTracker({PATIENT: tracker.trackers[PATIENT]}, SEARCH_S)
+    tracker = make_body_tracker(config, targets_of(config), cameras, known.uncertainty, bits if bits > 8 else None)
+    alone = BodyTracker({PATIENT: tracker.trackers[PATIENT]}, further=False)
     reference = reference_of(config, alone)
     return by_patient(alone, reference)
 

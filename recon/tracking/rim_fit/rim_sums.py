@@ -28,6 +28,7 @@ from recon.tracking.rim_fit.sectors import (
     steep,
 )
 
+SQUARE, AWAY, AT, DISTANCE, SLOPE = range(5)  # of a row's pixels: of `away`; see `Place`; the sector and the share of it before
 FAST = {"reassoc", "contract", "arcp", "nsz"}  # all but what is not finite
 
 
@@ -64,34 +65,47 @@ def add_up(image, rim: Rim, own, noise: SideNoise, sectors, stride, hole, sums):
     highest = min(1 + outer * 1.2 / shortest, 1 + OUTERMOST)
     left, right, top, bottom = window(rim, highest, image.shape)
     highest = highest * highest
+    row = np.empty((SLOPE + 1, max(right - left, 1)))
     for v in range(top, bottom, stride):
         y = v - rim.y
         middle, half, empty = _chords(shape, y, lowest, highest)
         middle += rim.x
         if not half >= 0:
             continue
-        u = max(left, int(middle - half) + 1) - stride
+        u = max(left, int(middle - half) + 1)
         last = min(right - 1, int(middle + half))
-        while u + stride <= last:
-            u += stride
-            if abs(u - middle) < empty - 1:
-                u += int((middle + empty - 1 - u) / stride) * stride
-            x = u - rim.x
-            p, q = shape.a * x + shape.b * y, shape.b * x + shape.c * y
-            square = p * p + q * q
-            if square < lowest or square > highest:
-                continue
-            away = math.sqrt(square)
-            p, q = p / away, q / away
-            at = sector(p, q)
-            j = int(at)
-            distance, slope = _distance(shape, p, q, away)
-            if distance < -sectors[j].inner or distance > sectors[j].outer:
-                continue
-            place = Place(x / radius, y / radius, at - j - 0.5, away, slope, distance + sectors[j].pull)
-            light = _light(image[v, u], rim, own[j], sectors[j], place, hole)
-            _accumulate(sums[j], light, place.distance, sectors[j].wide, noise)
+        hollow = min(int(middle - empty) + 1, last) if empty > 1 else last
+        while u <= last:  # before the hollow, then past it
+            count = max((hollow - u) // stride + 1, 0)
+            _survey(shape, rim.x, u, y, stride, count, row)
+            for i in range(count):
+                if row[SQUARE, i] < lowest or row[SQUARE, i] > highest:
+                    continue
+                at, distance = row[AT, i], row[DISTANCE, i]
+                j = int(at)
+                if distance < -sectors[j].inner or distance > sectors[j].outer:
+                    continue
+                x = u + i * stride - rim.x
+                place = Place(x / radius, y / radius, at - j - 0.5, row[AWAY, i], row[SLOPE, i], distance + sectors[j].pull)
+                light = _light(image[v, u + i * stride], rim, own[j], sectors[j], place, hole)
+                _accumulate(sums[j], light, place.distance, sectors[j].wide, noise)
+            u += count * stride
+            u += max(int((middle + empty - 1 - u) / stride), 0) * stride
+            hollow = last
     _mirror(sums)
+
+
+@njit(inline="always", error_model="numpy")
+def _survey(shape: Shape, centre, first, y, stride, count, row):
+    """Fill a row's places relative to the ellipse, without branches, so that pixels share vector instructions."""
+    for i in range(count):
+        x = first + i * stride - centre
+        p, q = shape.a * x + shape.b * y, shape.b * x + shape.c * y
+        square = p * p + q * q
+        away = math.sqrt(square)
+        p, q = p / away, q / away
+        distance, slope = _distance(shape, p, q, away)
+        row[SQUARE, i], row[AWAY, i], row[AT, i], row[DISTANCE, i], row[SLOPE, i] = square, away, sector(p, q), distance, slope
 
 
 @njit(inline="always")

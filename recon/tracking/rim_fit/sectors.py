@@ -137,11 +137,10 @@ def _direction(j):
 @njit(inline="always", error_model="numpy")
 def sector(x, y):
     """Number of the sector of a direction, plus the share of it that lies before the direction."""
-    total = abs(x) + abs(y)
-    if x >= 0:
-        at = y / total if y >= 0 else 3 + x / total
-    else:
-        at = 1 - x / total if y >= 0 else 2 - y / total
+    right, below = x >= 0, y >= 0
+    along = y if right == below else x
+    quadrant = (0.0 if below else 3.0) if right else (1.0 if below else 2.0)
+    at = quadrant + (along if right else -along) / (abs(x) + abs(y))
     return min(at * (SECTORS / 4), SECTORS - 1e-9)
 
 
