@@ -77,15 +77,15 @@ def test_mistakes_are_made_and_judged(place, tmp_path):
 @pytest.mark.slow
 def test_killed_commands_lose_nothing(place, copies):
     """One that replaces a folder, by both signals; `reconstruct`, which goes on with its own, and recordings have theirs."""
-    tallies = kills.run(place, moments=2, seed=3, workers=1, only=["sweep"], command=copies.run, kill=copies.kill)
+    tallies = kills.run(place, moments=1, seed=3, workers=1, only=["sweep"], command=copies.run, kill=copies.kill)
     assert all(tally.good for tally in tallies), tallies
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not full_disk.can_mount(), reason="a small disk can't be mounted")
 def test_full_disks_are_named_and_old_results_kept(place, copies):
-    found = full_disk.run(place, ["freehand", "sweep"], copies.run)
-    assert len(found) == 6 and all(one.good and one.outcome.status == 2 for one in found), full_disk.table(found)
+    found = full_disk.run(place, ["freehand"], copies.run)
+    assert len(found) == 3 and all(one.good and one.outcome.status == 2 for one in found), full_disk.table(found)
 
 
 @pytest.mark.slow
@@ -100,7 +100,7 @@ def test_two_writers_dont_mix(place, copies):
 @pytest.mark.slow
 def test_readers_survive_some_fuzzing(place):
     pytest.importorskip("atheris")
-    found = fuzzing.run(place, 600, only=["manifest", "image"], workers=1, inputs=2000)
+    found = fuzzing.run(place, 600, only=["manifest"], workers=1, inputs=2000)
     assert all(one.inputs >= 2000 and not one.faults for one in found), found
 
 

@@ -68,9 +68,9 @@ def test_faults_are_refused_by_name(fault, sizes, named, rng):
     ("fault", "sizes"),
     [(pivot_films.slipping, (0.4, 3.0)), (pivot_films.loosened, (0.4, 3.0)), (pivot_films.bending, (1.0, 3.0))],
 )
-def test_of_a_hundred_faults_95_are_refused(fault, sizes, rng):
-    messages, silent = outcomes(fault, rng, 100, sizes)
-    assert len(messages) >= 95 and silent == 0
+def test_of_fifty_faults_48_are_refused(fault, sizes, rng):
+    messages, silent = outcomes(fault, rng, 50, sizes)
+    assert len(messages) >= 48 and silent == 0
 
 
 def test_right_films_are_taken(rng):
@@ -83,14 +83,14 @@ def test_right_films_are_taken(rng):
 
 
 @pytest.mark.slow
-def test_of_200_right_films_at_most_two_are_refused(rng):
+def test_of_a_hundred_right_films_at_most_one_is_refused(rng):
     count = 0
-    for _ in range(200):
+    for _ in range(100):
         try:
             check(film(rng)[1])
         except InputError:
             count += 1
-    assert count <= 2
+    assert count <= 1
 
 
 def test_too_little_motion_is_refused_with_the_way_on(rng):
