@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from campaign import capture_mistakes as made
-from campaign import device_mistakes, pose_mistakes
+from campaign import device_mistakes, pose_mistakes, probe_mistakes
 from campaign import mistake_figures as figures_of
 from campaign.capture_mistakes import Mistake, both, given, json_field, reordered, seen, swapped, taken_from
 from campaign.mistake_figures import Figures
@@ -219,6 +219,43 @@ PROBE = Task(
     ),
 )  # fmt: skip
 
+
+def _set_up(source: str) -> tuple[Mistake, ...]:
+    """Wrong set-ups of a sweep over a phantom at rest, with the probe at rest in each B-scan."""
+    sweep = f"{source}/capture/sweep"
+    return (
+        *pose_mistakes.of_poses(f"{sweep}/track.csv"),
+        *(one for one in _images(f"{sweep}/us", "B-scans", ()) if one.kind == "mirrored"),
+        *probe_mistakes.of_motion(f"{sweep}/track.csv"),
+        *probe_mistakes.of_clip(321, 408),
+    )
+
+
+def _wired(name: str, source: str, fields: Line, mistakes: tuple[Mistake, ...], folders: Line = ()) -> Task:
+    """A calibration by a phantom."""
+    return Task(
+        f"calibrate-probe, {name}",
+        (("calibrate-probe", f"capture={source}/capture", *fields, "out=new"),),
+        (source, *folders),
+        lambda folder: figures_of.probe(folder / "new"),
+        mistakes,
+    )
+
+
+ROWED = ("phantom=n_wires",)
+WIRED = (
+    _wired("crossed wires", "wires", (), (
+        *_set_up("wires"), Mistake("device", "N-wires", r"dots|rows|phantom|wires", given("phantom=n_wires"))
+    )),
+    _wired("N-wires", "rows", ROWED, (*_set_up("rows"), *probe_mistakes.of_rows())),
+    *(
+        _wired(f"{name} in motion", source, (*fields, "lag_s=0.05"), tuple(
+            probe_mistakes.of_lag(f"{source}/capture/sweep/us/timestamps.csv")
+        ))
+        for name, source, fields in (("crossed wires", "moving", ()), ("N-wires", "moving_rows", ROWED))
+    ),
+)  # fmt: skip
+
 BOTTOM = "bottom/capture/sweep"
 LAG = Task(
     "measure-lag",
@@ -387,4 +424,4 @@ IMPORT_SWEEP = Task(
     ),
 )  # fmt: skip
 
-TASKS = (SURFACE, OPTICS, PROBE, LAG, TRACK, TARGET, FREEHAND, SEGMENT, DESCRIBE, IMPORT_SWEEP)
+TASKS = (SURFACE, OPTICS, PROBE, *WIRED, LAG, TRACK, TARGET, FREEHAND, SEGMENT, DESCRIBE, IMPORT_SWEEP)

@@ -110,7 +110,7 @@ POSES: Mapping[str, tuple[str, str, Callable[[Array, Rng], Array]]] = {
     **{
         f"poses' translations in {name}": (
             "units",
-            r"unit|metres|inch",
+            r"unit|metres|inch|in cm|in mm",
             partial(_scaled, factor),
         )
         for name, factor in UNITS.items()

@@ -21,6 +21,7 @@ from tests.recon.tip_calibration import pivot_films
 
 LONGEST_S = 600.0
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,8]", "path.speed_mm_s=20")
+MOVING = ("path.rest_s=0", "path.move_s=1.5", "clocks.scanner_hz=6")
 MADE = (  # command lines in the order in which they are run
     ("render", "scene=sphere", "cameras=[cam1]", "tracing.samples=4", "out=ball"),
     ("render", "scene=board", "poses=demo", "poses.count=5", "patterns=paper_calibration", "cameras=[cam1,cam2]",
@@ -30,6 +31,9 @@ MADE = (  # command lines in the order in which they are run
     ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=12", "out=rows"),
     ("sweep", "scene=plane", "ultrasound=water", "path=tilts", "path.count=20", "out=wall"),
     ("sweep", "scene=sphere", "ultrasound=water", "path=tilts", "path.count=20", "out=sphere"),
+    ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=9", *MOVING, "path.roll_deg=60", "out=moving"),
+    ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=9", *MOVING, "path.tilt_deg=15", "path.roll_deg=15",
+     "out=moving_rows"),
     ("sweep", "scene=tank", "ultrasound=water", "path=bob", "path.seconds=2", "out=bottom"),
     ("sweep", *STROKE, "out=scan"),
     ("sweep", "path=raster", "out=raster"),

@@ -31,6 +31,7 @@ SETTLED, STEADY = 0.02, 0.05  # step of the lag over its standard deviation, and
 MOST_STEP_S = 0.05  # of the lag, a round
 LEAST_JITTER_S = 1e-4  # that changes nothing
 MAX_SIGMA_S = 0.005  # of a lag that the motion determines
+STILL_MM_S = 3.0  # speed of the target below which it rests, but for noise
 CONTRADICTS_MM2 = 0.25  # mean square misfit from which on another lag, of half of it, is named as a refusal's cause
 
 

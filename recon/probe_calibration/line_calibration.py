@@ -535,7 +535,8 @@ def calibrate(
     found = _without_outliers(start, problem)
     rms = _rms(_residuals(found.estimate, problem)[found.inliers])
     astray = (found.inliers.mean(axis=0) < MIN_INLIERS).sum()
-    if found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS or astray > MOST_ASTRAY:
+    contradict = found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS or astray > MOST_ASTRAY
+    if contradict or not _plausible(found.estimate):
         _say_why(problem, found, rms, numbers)
     several = np.repeat(problem.frames.poses, problem.phantom.count, axis=0), problem.frames.pixels.reshape(-1, 2)
     if wires.registration is None:
@@ -812,15 +813,21 @@ def _held_out(problem: _Problem, found: _Fit, start: _Estimate) -> float:
     return _rms(np.concatenate(left))
 
 
+def _plausible(estimate: _Estimate) -> bool:
+    """Whether the scales are those of a scanner; poses that hardly move fit an image that is a point."""
+    return bool(((estimate.scale >= probe_checks.SCALES[0]) & (estimate.scale <= probe_checks.SCALES[1])).all())
+
+
 def _say_why(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int64] | None) -> None:
     """Refuse dots that don't lie on the wires of a phantom at rest, and name the reading under which they would."""
     some = np.unique(np.linspace(0, len(found.inliers) - 1, MOST_TRIED).astype(int))
     few, misfits = problem.of(some), {}
     for meaning, other in _readings(few):
         start = _robust_start(other, np.random.default_rng(0), DRAWS_TRIED, refined=1)
-        misfits[meaning] = float(np.sqrt(_median(start, other)))
+        misfits[meaning] = float(np.sqrt(_median(start, other))) if _plausible(start) else np.inf
     likely = min(misfits, key=lambda meaning: misfits[meaning], default="")
-    if likely and misfits[likely] < min(_rms(_residuals(found.estimate, problem)) / 2, MAX_RMS_MM):
+    half = _rms(_residuals(found.estimate, problem)) / 2 if _plausible(found.estimate) else np.inf
+    if likely and misfits[likely] < min(half, MAX_RMS_MM):
         raise InputError(f"dots: expected on the wires of a phantom at rest, found {likely}: read so, they are")
     away = np.sqrt((_residuals(found.estimate, problem) ** 2).sum(axis=-1).mean(axis=1))
     names = np.arange(len(away)) if numbers is None else numbers

@@ -283,6 +283,9 @@ def name_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> str:
     kind = registry.kind(PHANTOMS, frames.phantom)
     if settings.lag_s == FREE or not sweep.clocked or not hasattr(kind, "misfit") or len(frames.usable) < kind.MIN_FRAMES:
         return ""
+    speeds = np.linalg.norm(rates(sweep, settings.taken_lag_s)[frames.usable, :3, 3], axis=1)
+    if np.median(speeds) < free_lag.STILL_MM_S:
+        return ""
     try:
         lag_s, least = search_lag(frames, sweep, settings)
     except InputError:

@@ -140,7 +140,10 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
             ["scene=cylinders", "path.surface=inner", "path.start_mm=[0,-2]", "path.end_mm=[2,-2]"],
             "path: expected the probe in front of all things, found it in outer after 0.00 s",
         ),
-        (["path=wires"], "path: expected one of bob, hold, none, raster, rows, stroke, tilts, wire, found wires; did you mean wire?"),
+        (
+            ["path=wires"],
+            "path: expected one of bob, hold, none, raster, rows, stroke, tilts, wire, found wires; did you mean wire?",
+        ),
         (["path.kind=fly"], "path.kind: expected one of 'stroke', 'hold', 'bob', 'wire', 'rows', 'tilts', found 'fly'"),
         (["path.speed_mm_s=0"], "speed_mm_s: expected greater than 0, found 0"),
         (["ultrasound.image_size=[96,96]"], "ultrasound.image_size: expected rig.probe's [321, 408], found [96, 96]"),

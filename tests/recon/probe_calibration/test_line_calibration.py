@@ -112,6 +112,16 @@ def in_metres(poses):
     return scaled
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_few_poses_in_inches_are_no_phantom_strung_otherwise(seed, probe):
+    """They hardly move, so other wires fit as well, but of an image that is a point."""
+    rng = np.random.default_rng(seed)
+    sightings = wire_rows.observe(probe, FCAL, wire_rows.poses_over(probe, FCAL, SIZE, rng, count=12), rng)
+    sightings.poses[:, :3, 3] /= 25.4
+    with pytest.raises(InputError, match="found poses in inches: read so, they are"):
+        calibrate(sightings)
+
+
 @pytest.mark.parametrize(("change", "said"), [
     (in_metres, "poses in m: read so"),
     (np.linalg.inv, "poses of target_from_world, the inverse: read so"),
