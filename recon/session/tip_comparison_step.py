@@ -42,7 +42,7 @@ BESIDE = "out of the plane by tracking"  # kind of a reason
 LEAST = 5  # B-scans with a tip
 WAYS = {
     needle_echo.FAR: "another tool's tip.yaml, another probe's calibration, or clocks that differ? measure-lag finds lag_s",
-    BESIDE: "lead the tip in the image's plane, or give beside_mm",
+    BESIDE: "lead the tip in the plane; if it is seen there, it lies elsewhere in the tool's frame: beside_mm=3 measures it",
     "no echo stands out": "another scanner? give appearance.min_contrast_db",
 }
 CAUSES: Mapping[str, tuple[str, str]] = {  # of faults: what is off, and the likely cause
