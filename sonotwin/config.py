@@ -36,7 +36,7 @@ OF_SOME_VERBS = {  # choices of a group that only these verbs take
     "devices/virtual": ("record",),
     **dict.fromkeys(("path/hand", "path/pivot"), ("film",)),
     **dict.fromkeys(
-        ("path/bob", "path/hold", "path/none", "path/raster", "path/rows", "path/stroke", "path/wire"),
+        ("path/bob", "path/hold", "path/none", "path/raster", "path/rows", "path/stroke", "path/tilts", "path/wire"),
         ("demo", "record", "sweep"),
     ),
 }

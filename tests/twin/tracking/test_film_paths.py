@@ -126,7 +126,7 @@ def test_what_cannot_be_led_to_an_aim_is_refused(config):
 
 def test_films_have_paths_of_their_own():
     assert groups("film")["path"] == ["hand", "pivot"]
-    assert groups("sweep")["path"] == ["bob", "hold", "none", "raster", "rows", "stroke", "wire"]
+    assert groups("sweep")["path"] == ["bob", "hold", "none", "raster", "rows", "stroke", "tilts", "wire"]
     with pytest.raises(InputError, match=r"path"):
         load("sweep", ["out=unused", "path=pivot"], sweep.Config)
     with pytest.raises(InputError, match=r"tip_mm"):
