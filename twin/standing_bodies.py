@@ -31,7 +31,7 @@ def with_standing(scene: Scene, rig: Rig, led: LedBodies, seed: int) -> tuple[Sc
     poses, made = dict[str, Array](), list(scene.things)
     centres = np.array([device.optics.camera().centre for device in (rig.cam1, rig.cam2)])
     meshes = [thing.mesh for thing in scene.things if not thing.inside]
-    about = np.mean([mesh.bounds.mean(axis=0) for mesh in meshes[:1]] or [np.zeros(3)], axis=0)
+    about = meshes[0].bounds.mean(axis=0)  # of what is scanned
     for name, path in led.standing(rig).items():
         target, number = rig.bodies[name], list(rig.bodies).index(name) + 1
         pose = led.lead(name, path, rig, np.eye(4), seed, STILL).pose(0.0)

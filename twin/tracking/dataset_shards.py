@@ -111,7 +111,7 @@ def prepare(place: Place, settings: Settings) -> list[int]:
         If the folder holds a data set of other settings or of another version, or something else.
     """
     told = place.folder / SETTINGS
-    unused = {} if settings.rig.bodies else {"ranges": {"bodies"}}
+    unused = {} if settings.rig.bodies else {"ranges": {"bodies"}}  # so that sets of one body go on from before there were others
     written = {"version": settings.version, **settings.model_dump(mode="json", exclude=unused)}
     if told.exists():
         _check_same(told, written)
