@@ -174,7 +174,7 @@ def test_figures_and_picture_are_of_one_moment(tmp_path):
 
     try:
         with headless_browser.opened(view.address, tmp_path / "profile") as page:
-            for k in range(80):
+            for k in range(40):
                 publish(k)
                 sleep(0.05)
                 if (shown := page.run(SHOWN)) is not None:

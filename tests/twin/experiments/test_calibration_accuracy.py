@@ -127,11 +127,11 @@ def test_bent_board(rig, rng):
 
 @pytest.mark.slow
 def test_rendered_calibration(setup, rig, monkeypatch):
-    """Ten rendered poses: residuals and parameters within the bars, and planes and sphere measured with them.
+    """Seven rendered poses: residuals and parameters within the bars, and planes and sphere measured with them.
 
     The bars are those of the full rows, though a quarter of the rays, and of camera 1's pixels, leaves more noise.
     """
     monkeypatch.setattr(calibration_accuracy, "TRACING", Tracing(samples=4, room_lux=20))
     small = replace(setup, rig=rig.model_copy(update={"cam1": half(rig).cam1}))
     for function in (calibration_accuracy.against_truth, calibration_accuracy.surfaces):
-        check(function, function(small, poses=10))
+        check(function, function(small, poses=7))
