@@ -73,7 +73,7 @@ def find(
     Raises
     ------
     InputError
-        If the motion doesn't determine the lag to MAX_SIGMA_S.
+        If the motion doesn't determine the lag to MAX_SIGMA_S, or it doesn't settle.
     """
     lag, jitter = start, 0.0
     for _ in range(ROUNDS):
@@ -83,7 +83,7 @@ def find(
         lag, jitter = lag + float(np.clip(late.seconds, -MOST_STEP_S, MOST_STEP_S)), wider
         if steady and abs(late.seconds) < SETTLED * late.sigma_s:
             break
-    if not late.sigma_s <= MAX_SIGMA_S:
+    if late.sigma_s > MAX_SIGMA_S or abs(late.seconds) > late.sigma_s:
         found = "the probe at rest" if np.isinf(late.sigma_s) else f"{lag:.3f} ± {late.sigma_s:.3f} s"
         expected = f"expected a motion that determines it to {MAX_SIGMA_S:g} s (1 sigma)"
         way = "keep moving to all sides while recording, or use measure-lag and give lag_s"

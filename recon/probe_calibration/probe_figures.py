@@ -21,6 +21,7 @@ FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
 EDGE = 3  # frames, too few to find a sudden movement by
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
+NOISY = 3.0  # times the assumed noise, beyond which something else than noise is likely, though few frames don't show what
 FREEZING_F = 32.0  # degrees Fahrenheit
 
 
@@ -100,6 +101,9 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
     left_out = f", {len(numbers)} outlier{'s' if len(numbers) > 1 else ''} left out ({_listed(numbers)})" if numbers else ""
     rms, factor = figures["rms_mm"], figures["noise_factor"]
     yield f"calibrate   {figures['frames_used']} frames{left_out}; RMS {rms:.3f} mm, noise {factor:.2f} times the assumed"
+    if factor > NOISY:
+        likely = "a bracket that slipped, a phantom that was pushed, a lag, or a tracker that is less exact than noise= says"
+        yield f"warning     the frames agree to {factor:.1f} times the assumed noise only: {likely}"
     yield from registry.kind(PHANTOMS, frames.phantom).describe(found, settings)
     scales = ", ".join(
         f"{name} {figures[f'{name}_mm_per_px']:.5f} ± {figures[f'{name}_sigma_mm_per_px']:.5f}" for name in ("sx", "sy")

@@ -99,6 +99,14 @@ def test_a_bracket_that_was_bent_since_is_noticed(calibrated, capture):
     assert lines[1].startswith("warning") and "2.00 deg" in lines[1] and "bent bracket" in lines[1]
 
 
+def test_frames_that_scatter_by_more_than_noise_are_warned_of(capture, tmp_path):
+    """As by a slip that few frames don't show: here noise is told to be a tenth of what it is."""
+    told = ["noise.angle_deg=0.008", "noise.position_mm=0.005", "noise.slice_mm=0.01"]
+    fields = [f"capture={capture}", f"out={tmp_path / 'out'}", f"lag_s={LAG_S}"]
+    assert not any("assumed noise only" in line for line in calibrate(*fields))
+    assert any("assumed noise only: a bracket that slipped" in line for line in calibrate(*fields, *told))
+
+
 def test_the_authors_program_reads_it(calibrated):
     """Equation 1 with the names of the authors' file puts a pixel where the calibration does; the speed is kept beside them."""
     out, _ = calibrated
