@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
+from itertools import pairwise
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -29,7 +30,8 @@ def in_threads(kernel: Callable[..., Any], count: int, *arguments: Any) -> None:
         kernel(0, count, *arguments)
         return
     parts = min(PARTS_A_THREAD * threads, count)
-    left = deque((count * k // parts, count * (k + 1) // parts) for k in range(parts))
+    ends = [-(-count * k // parts) for k in range(parts + 1)]  # a larger part isn't the last one, which the others wait for
+    left = deque(pairwise(ends))
 
     def work() -> None:
         while True:

@@ -46,7 +46,7 @@ class _Search:
     settled: dict[str, Tracking]  # by the parts that were done, and not taken yet
     ended: bool = False
 
-    def advanced(self, whole: bool = False) -> dict[str, Tracking]:
+    def advance(self, whole: bool = False) -> dict[str, Tracking]:
         """Results that the next part settles, or all parts that are left."""
         for _ in self.parts:
             if not whole:
@@ -89,12 +89,14 @@ class BodyTracker:
         if first.networks is not None:
             in_parts = bool(found) and time_s is not None and self.search_s > 0
             if self._search_is_due(found, moment, in_parts):
-                search = self._begun(Detections(frames, first.networks, CIRCLES, named=False), found)
-                results |= search.advanced(whole=not in_parts)
+                settled: dict[str, Tracking] = {}
+                detections = Detections(frames, first.networks, CIRCLES, named=False)
+                search = _Search(self._parts(detections, found, settled), settled)
+                results |= search.advance(whole=not in_parts)
                 if not in_parts or self._search is None:
                     self._search = search
             elif self._search is not None:
-                earlier = self._search.advanced()
+                earlier = self._search.advance()
                 there = {name: one for name, one in earlier.items() if one.found and name not in found}
                 results |= {name: one for name, one in earlier.items() if not one.found} | _beside(found, earlier)
             if self._search is not None and self._search.ended:
@@ -133,11 +135,6 @@ class BodyTracker:
             return False
         self._searched, self._looked = moment.now, moment.now if look else self._looked
         return True
-
-    def _begun(self, detections: Detections, found: Mapping[str, Tracking]) -> _Search:
-        """A search that has begun."""
-        settled: dict[str, Tracking] = {}
-        return _Search(self._parts(detections, found, settled), settled)
 
     def _parts(self, detections: Detections, found: Mapping[str, Tracking], told: dict[str, Tracking]) -> Iterator[None]:
         """Parts of a search; each adds what it settles to `told`: results of the bodies that aren't found yet, and those of the

@@ -245,19 +245,19 @@ def _rows(guess: _Guess, problem: _Problem) -> Rows:
         if view.counted == WHOLE:
             slopes = np.concatenate([slopes, _shape_slopes(view, guess, problem)], axis=1)
         rows.append(slopes.reshape(-1, PARAMETERS + k))
-        left.append((view.measured - _predicted(view, guess, problem)[:, : view.counted]).ravel())
+        left.append((view.measured - _predicted(view, guess, circles)[:, : view.counted]).ravel())
     design = np.vstack([problem.whiten @ np.concatenate(rows), np.eye(k, PARAMETERS + k, PARAMETERS)])
     return Rows(design, np.concatenate([problem.whiten @ np.concatenate(left), -guess.deviations]))
 
 
-def _predicted(view: Sighting, guess: _Guess, problem: _Problem) -> Array:
+def _predicted(view: Sighting, guess: _Guess, circles: Circles) -> Array:
     """Numbers of the ellipses of the n circles seen : (n, 5) px."""
-    return _numbers(*ellipses_of(view.camera, guess.world_from_target, *_placed(guess, problem).some(view.seen)))
+    return _numbers(*ellipses_of(view.camera, guess.world_from_target, *circles.some(view.seen)))
 
 
 def _numbers(centres: Array, shapes: Array) -> Array:
     """Of n ellipses, x, y, a, b, c : (n, 5) px."""
-    return np.column_stack([centres, shapes[:, 0, 0], shapes[:, 0, 1], shapes[:, 1, 1]])
+    return np.concatenate([centres, shapes.reshape(-1, 4)[:, [0, 1, 3]]], axis=1)
 
 
 def _centre_slopes(view: Sighting, guess: _Guess, circles: Circles, problem: _Problem) -> Array:

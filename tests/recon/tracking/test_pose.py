@@ -415,7 +415,7 @@ def test_slopes_of_shapes_are_those_of_a_pose_that_is_moved(cameras, target, rng
         for k, fast in enumerate(np.moveaxis(pose_fit._shape_slopes(view, guess, problem), 2, 0)[:6]):
             way = pose_fit.STEPS[k]
             ahead, behind = (
-                pose_fit._predicted(view, guess._replace(world_from_target=rigid.moved(true, side * way)), problem)[:, 2:]
+                pose_fit._predicted(view, guess._replace(world_from_target=rigid.moved(true, side * way)), problem.circles)[:, 2:]
                 for side in (1, -1)
             )
             size = 1.0 if k < 3 else 0.001  # of a disc, or of its change by 1 mm
