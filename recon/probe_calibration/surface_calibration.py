@@ -42,7 +42,6 @@ from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
 from recon.estimation.levenberg_marquardt import USUAL, Rules, Unreachable, descend
 from recon.estimation.parameters import Blocks
-from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
@@ -613,10 +612,10 @@ def calibrate(
         raise InputError(f"sphere_radius_mm: expected the sphere's radius, found {found}: its diameter, another unit or sphere?")
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
-    step, covariance = movement.average(equations, solved, inliers)
+    alike = movement.alike(slopes[inliers], left[inliers], equations.known) if moved is None else moved.alike
+    step, covariance = movement.average(equations, solved, inliers, alike=alike)
     estimate = estimate.moved(Step(step, np.zeros((0, 0))))
-    alike = persistence(left[inliers])
-    covariance = alike * covariance[: len(NAMES), : len(NAMES)]
+    covariance = covariance[: len(NAMES), : len(NAMES)].copy()
     if lag[2] is not None and sightings.lag_sigma_s:
         covariance = covariance + sightings.lag_sigma_s**2 * np.outer(lag[2], lag[2])
     try:
