@@ -173,7 +173,7 @@ def _fit(equations: FrameEquations, what: str, course: Course, used: Mask, trial
     rest = left - moving @ solution
     if not _explained(rest, frames & ~used, frames):
         return None
-    alike = persistence(rest.reshape(-1, 3))
+    alike = persistence(rest.reshape(int(frames.sum()), -1))
     freedom = (len(left) - unknowns) / alike
     if freedom < LEAST_FREEDOM:
         return None

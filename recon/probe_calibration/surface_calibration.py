@@ -14,12 +14,17 @@ the depth. Predicted errors (1 sigma, of the worst pixel's place) by 0.05 degree
 
     tilt, rock, roll     60 frames of a wall     100 of a wall     100 of a sphere, up to 8 mm aside
     6, 8, 90 deg                1.9                   1.3                        0.19
-    20, 15, 60 deg              0.77                  0.55                       0.17
-    40, 25, 90 deg              0.25                  0.18                       0.16
+    20, 15, 60 deg              0.77                  0.56                       0.17
+    40, 25, 90 deg              0.33                  0.26                       0.16
 
 **A mirror.** A rough surface shines where the image's plane meets it. A smooth one shines where it is square to the beam, so its
 echo comes from nearer the foot of the perpendicular: of a wall at a depth y that is tilted by t across the plane up to
 y (1 - cos t) nearer, of a surface of curvature k up to 1 / (1 + k y) of that. The share of it is one more unknown.
+
+**A thick slice.** A rough surface tilted across the slice by t is met over a range of depths, in which the beam gets wider
+and weaker: the middle of its echo lies by c tan(t)^2 before the place where the image's plane meets it, c being some tenths of
+a millimetre. So small a shift goes with the tilt as a wall's distance does, which makes a wall's depth unsure by some 2 c. It
+is an unknown with a standard deviation, too.
 
 Source of the wall: Prager, Rohling, Gee and Berman 1998, Rapid calibration for 3-D freehand ultrasound.
 """
@@ -37,7 +42,6 @@ from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
 from recon.estimation.levenberg_marquardt import USUAL, Rules, Unreachable, descend
 from recon.estimation.parameters import Blocks
-from recon.estimation.persistence import persistence
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
@@ -49,8 +53,9 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Size = tuple[int, int]  # width, height, px
 
-MIN_FRAMES = 10  # eleven unknowns and the mirror's, by two or three numbers a frame
+MIN_FRAMES = 10  # eleven unknowns and two of the echo's, by two or three numbers a frame
 MIRROR, MIRROR_SIGMA = 0.5, 0.5  # share of a mirror beforehand
+NEARER_SIGMA_MM = 0.25  # of an echo before the surface, tilted by 45 degrees; the twin's slice makes it 0.1 to 0.4 by depth
 MOST_MIRROR, WIDEST = 10.0, 1e3  # share and mm/px, beyond which steps are too long
 SHRUNK = 1e-5  # mm/px, of an image that shrank to a point, whatever the unit of the poses
 ARM_MM = 50.0  # at which a wall's tilt counts in mm
@@ -63,7 +68,7 @@ REWEIGHTED, REWEIGHTED_MM = 5, 0.1  # rounds, and the distance below which all c
 DRAWS = 50  # random sets of a sphere's frames; at 20 % outliers 0.8**10 = 11 % of them are clean
 REFINED = 6  # starts that are refined, the best
 REFINE = Rules(steps=8)  # of these, which need not converge
-STEEPEST = 0.95  # sine of a tilt across the plane
+STEEPEST, FLATTEST = 0.95, 0.3  # sine of a tilt across the plane, at most; cosine of one between beam and normal, at least
 LEAST, LEAST_LEVEL = 1e-12, 1e-3  # measured noise over the assumed: exact numbers have none
 SURE, LIKELY = 5.0, 3.0  # standard deviations from which on an unusual value is told, of a sphere's radius beside others
 BENDS = 0.01  # of a radius, by which speckle on its slopes may bend all arcs alike
@@ -242,15 +247,16 @@ class _Estimate:
     scale: Array  # (2,) mm/px
     surface: Surface
     mirror: float = 0.0  # share
+    nearer_mm: float = 0.0  # shift of an echo by the slice's thickness, at 45 degrees
 
     def moved(self, step: Step) -> "_Estimate":
         """After a step of `_unknowns`; `Unreachable` where no image can be."""
-        scale, probe, surface, mirror = _unknowns(self.surface).split(step.shared)
-        share = self.mirror + float(mirror[0])
+        scale, probe, surface, (mirror, nearer) = _unknowns(self.surface).split(step.shared)
+        share = self.mirror + float(mirror)
         if np.abs(self.scale + scale).max() > WIDEST or np.abs(probe[3:]).max() > rigid.FARTHEST_MM or abs(share) > MOST_MIRROR:
             raise Unreachable("a step that leads out of all images")
         pose = rigid.moved(self.target_from_image, probe)
-        return _Estimate(pose, self.scale + scale, self.surface.moved(surface), share)
+        return _Estimate(pose, self.scale + scale, self.surface.moved(surface), share, self.nearer_mm + float(nearer))
 
     def axes(self, poses: Array) -> Array:
         """The image's axes : (n, 3, 3) in the world, columns."""
@@ -278,7 +284,7 @@ class _Linear:
 
 def _unknowns(surface: Surface) -> Blocks:
     """The first as `recon.model.probe.NAMES`."""
-    return Blocks({"scale": 2, "probe": 6, "surface": len(surface.known), "mirror": 1})
+    return Blocks({"scale": 2, "probe": 6, "surface": len(surface.known), "echo": 2})
 
 
 def _known(estimate: _Estimate) -> tuple[Array, Array]:
@@ -286,7 +292,8 @@ def _known(estimate: _Estimate) -> tuple[Array, Array]:
     blocks = _unknowns(estimate.surface)
     known, departures = np.zeros(len(blocks)), np.zeros(len(blocks))
     known[blocks["surface"]], departures[blocks["surface"]] = estimate.surface.known, estimate.surface.departures
-    known[blocks["mirror"]], departures[blocks["mirror"]] = MIRROR_SIGMA**-2, estimate.mirror - MIRROR
+    known[blocks["echo"]] = MIRROR_SIGMA**-2, NEARER_SIGMA_MM**-2
+    departures[blocks["echo"]] = estimate.mirror - MIRROR, estimate.nearer_mm
     return known, departures
 
 
@@ -299,7 +306,9 @@ def _linear(estimate: _Estimate, frames: CurveSightings, noise: Noise) -> _Linea
     cosine, depth = np.sqrt(1 - sine**2), frames.pixels[..., 1] * estimate.scale[1]
     reach = depth / (1 + surface.curvature * depth)
     deeper = reach * (1 - cosine)
-    behind = frames.pixels + (estimate.mirror * deeper / estimate.scale[1])[..., None] * [0, 1]
+    down = np.minimum((surface.normals(places) * axes[:, None, :, 1]).sum(axis=-1), -FLATTEST)
+    slope = np.minimum((sine / down) ** 2, FLATTEST**-2)
+    behind = frames.pixels + ((estimate.mirror * deeper + estimate.nearer_mm * slope) / estimate.scale[1])[..., None] * [0, 1]
     by_place, by_surface = surface.turns(places, across)
     shown = replace(frames, pixels=behind)
     arms = estimate.arms(shown)
@@ -315,7 +324,7 @@ def _linear(estimate: _Estimate, frames: CurveSightings, noise: Noise) -> _Linea
     slopes[..., blocks["probe"].start : blocks["probe"].start + 3] += turned
     slopes[..., 1] -= along * estimate.mirror * deeper * surface.curvature * reach / estimate.scale[1]
     slopes[..., blocks["surface"]] = surface.slopes(places) + by_sine * by_surface
-    slopes[..., blocks["mirror"]] = (along * deeper)[..., None]
+    slopes[..., blocks["echo"]] = along[..., None] * np.stack([deeper, slope], axis=-1)
     pose = noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
     by_pose = (normals[..., None, :] @ rigid.slopes(arms))[..., 0, :]
     by_row = along * estimate.scale[1]
@@ -471,7 +480,7 @@ def _without_outliers(start: _Estimate, frames: CurveSightings, noise: Noise) ->
 def _level(estimate: _Estimate, frames: CurveSightings, noise: Noise) -> float:
     """Measured noise over the assumed, with the freedom that what is known leaves."""
     left = _whitened(estimate, frames, noise)[1]
-    unknowns = len(NAMES) + 3  # the mirror's share and a radius are all but known
+    unknowns = len(NAMES) + 3  # the echo's and a radius are all but known
     return max(float(np.sqrt((left**2).sum() / max(left.size - unknowns, 1))), LEAST_LEVEL)
 
 
@@ -603,10 +612,10 @@ def calibrate(
         raise InputError(f"sphere_radius_mm: expected the sphere's radius, found {found}: its diameter, another unit or sphere?")
     moved = movement.find(equations, inliers)
     solved, inliers = inliers, inliers if moved is None else moved.frames
-    step, covariance = movement.average(equations, solved, inliers)
+    alike = movement.alike(slopes[inliers], left[inliers], equations.known) if moved is None else moved.alike
+    step, covariance = movement.average(equations, solved, inliers, alike=alike)
     estimate = estimate.moved(Step(step, np.zeros((0, 0))))
-    alike = persistence(left[inliers])
-    covariance = alike * covariance[: len(NAMES), : len(NAMES)]
+    covariance = covariance[: len(NAMES), : len(NAMES)].copy()
     if lag[2] is not None and sightings.lag_sigma_s:
         covariance = covariance + sightings.lag_sigma_s**2 * np.outer(lag[2], lag[2])
     try:
@@ -626,7 +635,7 @@ def calibrate(
         np.sqrt(_squared(estimate, sightings, noise)) / level,
         ~inliers,
         level,
-        (estimate.mirror, float(np.sqrt(spread[-1, -1]))),
+        (estimate.mirror, float(np.sqrt(spread[blocks["echo"], blocks["echo"]][0, 0]))),
         by_arcs,
         lag[:2],
         _held_out(estimate, sightings.of(inliers), noise, level),

@@ -34,7 +34,7 @@ def poses_over(probe, surface, rng, count=100, tilt=40.0, rock=25.0, roll=90.0, 
     ])  # fmt: skip
 
 
-def curves_of(probe, surface, poses, mirror=0.0, half_mm=None):
+def curves_of(probe, surface, poses, mirror=0.0, nearer_mm=0.0):
     """Points : (n, k, 2) px of the curves: of a wall at Gauss's places of the whole width, of a sphere of its near side."""
     count = 3 if isinstance(surface, Sphere) else 2
     shares = np.array([-1, 0, 1]) * np.sqrt(0.6) if count == 3 else np.array([-1, 1]) / np.sqrt(3)
@@ -44,7 +44,7 @@ def curves_of(probe, surface, poses, mirror=0.0, half_mm=None):
         middle, half = (SIZE[0] - 1) / 2, (SIZE[0] - 1) / 2
         if count == 3:
             centre = rigid.apply(rigid.invert(world_from_image), surface.centre)
-            middle, half = centre[0] / probe.scale[0], (half_mm or 0.4 * surface.radius) / probe.scale[0]
+            middle, half = centre[0] / probe.scale[0], (0.4 * surface.radius) / probe.scale[0]
         for node, u in enumerate(middle + half * shares):
             start, down = rigid.apply(world_from_image, [u * probe.scale[0], 0, 0]), world_from_image[:3, 1]
             if count == 2:
@@ -53,16 +53,18 @@ def curves_of(probe, surface, poses, mirror=0.0, half_mm=None):
                 arm = start - surface.centre
                 b = arm @ down
                 y = -b - np.sqrt(b**2 - arm @ arm + surface.radius**2)
-            sine = surface.normals(start + y * down) @ world_from_image[:3, 2]
+            normal = surface.normals(start + y * down)
+            sine = normal @ world_from_image[:3, 2]
+            y -= nearer_mm * (sine / (normal @ down)) ** 2
             y -= mirror * y * (1 - np.sqrt(1 - sine**2)) / (1 + surface.curvature * y)
             result[k, node] = u, y / probe.scale[1]
     return result
 
 
-def observe(probe, surface, rng, mirror=0.0, half_mm=None, **motion):
+def observe(probe, surface, rng, mirror=0.0, nearer_mm=0.0, **motion):
     """The same with the tracker's and the scanner's noise."""
     poses = poses_over(probe, surface, rng, **motion)
-    pixels = curves_of(probe, surface, poses, mirror, half_mm)
+    pixels = curves_of(probe, surface, poses, mirror, nearer_mm)
     return noisy(poses, pixels, rng)
 
 

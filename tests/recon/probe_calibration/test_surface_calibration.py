@@ -80,15 +80,15 @@ def test_slopes_are_those_of_differences(surface, radius, rig, rng):
         assert slopes[..., k] == pytest.approx((ends[1] - ends[0]) / 2e-5, abs=3e-2 * np.abs(slopes[..., k]).max() + 1e-6)
 
 
-def normalised_errors(surface, radius, rig, sets: int, **conditions) -> tuple[np.ndarray, np.ndarray]:
+def normalised_errors(surface, radius, rig, sets: int) -> tuple[np.ndarray, np.ndarray]:
     """Errors : (sets, 9, 3) of places over their standard deviations, and lengths : (sets,) mm of the greatest."""
     probe, errors, lengths = true_probe(rig), [], []
     for k in range(sets):
         rng = np.random.default_rng(k)
         true = surface if radius is None else replace(surface, radius=radius[0] + radius[1] * rng.standard_normal())
-        found = surface_calibration.calibrate(
-            surface_sights.observe(probe, true, rng, **conditions), SIZE, radius, max_sigma_mm=5.0
-        ).calibration
+        nearer_mm = surface_calibration.NEARER_SIGMA_MM * rng.standard_normal()
+        seen = surface_sights.observe(probe, true, rng, nearer_mm=nearer_mm)
+        found = surface_calibration.calibrate(seen, SIZE, radius, max_sigma_mm=5.0).calibration
         off, covariance = away(found, probe), point_calibration.point_covariance(found, NINE)
         errors.append(off / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
         lengths.append(np.linalg.norm(off, axis=1).max())
