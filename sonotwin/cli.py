@@ -48,7 +48,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("calibrate-optics", "calibrate cameras and projector from images of a board, rendered or real"),
     Verb("calibrate-target", "measure the probe's target as it was printed, from any film of it"),
     Verb("calibrate-tip", "find a tracked tool's tip, from a film of it pivoting in a dimple"),
-    Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of crossed wires"),
+    Verb("calibrate-probe", "calibrate the ultrasound probe from B-scans of a phantom"),
     Verb("compare-tip", "compare a needle's tip in B-scans with the tracked one: tracker, tip and probe together"),
     Verb("measure-lag", "measure the lag of the scanner's images behind the tracked poses"),
     Verb("check", "check whether the rig is still as it was calibrated, before a session"),

@@ -42,6 +42,7 @@ class _Claim(NamedTuple):
 class _Search:
     """A search for what is lost, in a pair."""
 
+    moment: Moment  # of that pair
     parts: Iterator[None]
     settled: dict[str, Tracking]  # by the parts that were done, and not taken yet
     ended: bool = False
@@ -85,19 +86,20 @@ class BodyTracker:
             return {name: tracker.unseen(str(error)) for name, tracker in self.trackers.items()}
         results = self._followed(frames, moment)
         found = {name: result for name, result in results.items() if result.found}
-        there: dict[str, Tracking] = {}  # found in an earlier pair
+        there: dict[str, tuple[Tracking, Moment]] = {}  # found in an earlier pair
         if first.networks is not None:
             in_parts = bool(found) and time_s is not None and self.search_s > 0
             if self._search_is_due(found, moment, in_parts):
                 settled: dict[str, Tracking] = {}
                 detections = Detections(frames, first.networks, CIRCLES, named=False)
-                search = _Search(self._parts(detections, found, settled), settled)
+                search = _Search(moment, self._parts(detections, found, settled), settled)
                 results |= search.advance(whole=not in_parts)
                 if not in_parts or self._search is None:
                     self._search = search
             elif self._search is not None:
                 earlier = self._search.advance()
-                there = {name: one for name, one in earlier.items() if one.found and name not in found}
+                began = self._search.moment
+                there = {name: (one, began) for name, one in earlier.items() if one.found and name not in found}
                 results |= {name: one for name, one in earlier.items() if not one.found} | _beside(found, earlier)
             if self._search is not None and self._search.ended:
                 self._search = None
@@ -105,8 +107,8 @@ class BodyTracker:
         kept = {
             name: tracker.keep(results.get(name) or tracker.unseen(reason), moment) for name, tracker in self.trackers.items()
         }
-        for name, one in there.items():
-            self.trackers[name].keep(one, moment)
+        for name, (one, began) in there.items():
+            self.trackers[name].keep(one, began)
         seconds = {"bodies": (perf_counter() - start) / len(kept)}
         return {name: replace(result, seconds=seconds) for name, result in kept.items()}
 
