@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.estimation.persistence import persistence
+from recon.files.metrics import Metrics
 from recon.model.probe import NAMES
 
 Array = NDArray[np.float64]
@@ -44,6 +45,13 @@ class Lateness:
         """The lag, and the way on."""
         off = f"{'late' if self.seconds > 0 else 'early'} by {1e3 * abs(self.seconds):.0f} ± {1e3 * self.sigma_s:.0f} ms"
         return f"the B-scans are {off} beyond lag_s: add {self.seconds:+.3f} to it, or give lag_s=free, or hold still"
+
+
+def figures(late: Lateness | None) -> Metrics:
+    """The lag and its standard deviation, s; NaN where it stays open."""
+    if late is None or not np.isfinite(late.sigma_s):
+        return {"more_lag_s": np.nan, "more_lag_sigma_s": np.nan}
+    return {"more_lag_s": late.seconds, "more_lag_sigma_s": late.sigma_s}
 
 
 def of_residuals(

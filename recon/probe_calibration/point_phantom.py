@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.files.metrics import Metrics
-from recon.probe_calibration import cross_wire, point_calibration
+from recon.probe_calibration import cross_wire, lateness, point_calibration
 from recon.probe_calibration.cross_wire import Crossing
 from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.point_calibration import MIN_FRAMES, Adjustment, Sightings
@@ -65,8 +65,7 @@ def figures(found: Adjustment) -> Metrics:
     return {
         "wires_apart_mm": found.apart_mm,
         "frames_that_count_as_one": found.persistence,
-        "more_lag_s": np.nan if found.late is None else found.late.seconds,
-        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
+        **lateness.figures(found.late),
     }
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.geometry import rigid
-from recon.probe_calibration import line_calibration, plus_phantom, wire_dots
+from recon.probe_calibration import lateness, line_calibration, plus_phantom, wire_dots
 from recon.probe_calibration.cross_wire import SEVERAL, Appearance
 from recon.probe_calibration.line_calibration import MIN_FRAMES, DotSightings, LineAdjustment, Registration, Wires
 from recon.probe_calibration.phantom_frames import PhantomFrames
@@ -98,8 +98,7 @@ def figures(found: LineAdjustment) -> Metrics:
         "phantom_size": found.size[0],
         "phantom_size_sigma": found.size[1],
         "frames_that_count_as_one": found.persistence,
-        "more_lag_s": np.nan if found.late is None else found.late.seconds,
-        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
+        **lateness.figures(found.late),
     }
 
 
