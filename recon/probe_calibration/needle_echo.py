@@ -318,7 +318,7 @@ def _tip(shaft: _Shaft, inside: NDArray[np.bool_], least: float, contrast: float
 
 
 def _off(ends: Array, expected: Expected) -> float:
-    """Distance of a tip : (1, 2), or of the nearer end : (2, 2) of a rejected shaft, from the expected, over the most that is near."""
+    """Distance of the nearer of ends : (n, 2) from where the tip is expected, over the most that is near."""
     sigma = np.sqrt(np.linalg.eigvalsh(expected.covariance).max())
     return float(np.linalg.norm(ends - expected.pixel, axis=1).min() / (NEAR_PX + SIGMAS * sigma))
 

@@ -77,8 +77,8 @@ def test_a_shaft_across_the_plane_is_a_spot():
 
 def test_a_spot_far_from_where_tracking_has_the_tip_is_none():
     scan, pixel = image("water", rod(TIP, 10.0, 75.0)), echo_of(TIP, "water")
-    assert needle_echo.find(scan, None, Expected(pixel + [0, 15 * MM_PX], np.eye(2))).reason == needle_echo.FAR
-    near(needle_echo.find(scan, None, Expected(pixel + [0, 3 * MM_PX], np.eye(2))), pixel, 0.3)
+    assert needle_echo.find(scan, None, Expected(pixel + np.array([0, 15 * MM_PX]), np.eye(2))).reason == needle_echo.FAR
+    near(needle_echo.find(scan, None, Expected(pixel + np.array([0, 3 * MM_PX]), np.eye(2))), pixel, 0.3)
 
 
 @pytest.mark.parametrize(("wires", "reason"), [
