@@ -133,6 +133,8 @@ def find(image: NDArray, appearance: Appearance | None = None, expected: Expecte
     shafts, strongest = _shafts(relief, least), float(relief.max())
     if not shafts:
         spot = cross_wire.find(image, appearance)
+        if spot.found and expected is not None and _off(spot.pixel[None], expected) > 1:
+            return _none(FAR, strongest)
         return NeedleEcho(spot.pixel, spot.covariance, spot.contrast_db, spot.reason)
     low, high = np.array([0, look.top_px]) + BORDER_PX, np.array(relief.shape[::-1]) - 1 - BORDER_PX
     inside = [((one.ends > low) & (one.ends < high)).all(axis=1) for one in shafts]
@@ -141,7 +143,8 @@ def find(image: NDArray, appearance: Appearance | None = None, expected: Expecte
         return _none("ends at the image's border: the shaft goes through all of it", strongest)
     tips = [_tip(shafts[k], inside[k], least, strongest, expected) for k in ending]
     if expected is not None:
-        near = [k for k, one in enumerate(tips) if _off(shafts[ending[k]], one, expected) < 1]
+        ends = [one.pixel[None] if one.found else shafts[k].ends for k, one in zip(ending, tips, strict=True)]
+        near = [k for k, each in enumerate(ends) if _off(each, expected) < 1]
         if not near:
             return _none(FAR, strongest)
         tips, ending = [tips[k] for k in near], [ending[k] for k in near]
@@ -279,14 +282,17 @@ def _runs(bright: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _tip(shaft: _Shaft, inside: NDArray[np.bool_], least: float, contrast: float, expected: Expected | None) -> NeedleEcho:
-    """The end of a shaft that is its tip: inside the image; of two such ends the deeper one, or as the shaft is expected.
+    """The end of a shaft that is its tip: inside the image; of two such ends the one that is expected, or else the deeper one.
 
     inside : (2,) which ends are.
     """
     forward = bool(inside[1])
     if inside.all():
-        direction = np.array([0.0, 1.0]) if expected is None or expected.direction is None else expected.direction
-        forward = bool(direction @ shaft.line.along > 0)
+        if expected is None:
+            towards = np.array([0.0, 1.0])
+        else:
+            towards = expected.pixel - shaft.ends.mean(axis=0) if expected.direction is None else expected.direction
+        forward = bool(towards @ shaft.line.along > 0)
     levels = shaft.levels if forward else shaft.levels[::-1]
     begin, end = (shaft.begin, shaft.end) if forward else (len(levels) - shaft.end, len(levels) - shaft.begin)
     before = levels[max(end - LEVEL_PX[1], begin) : end - LEVEL_PX[0]]
@@ -311,9 +317,8 @@ def _tip(shaft: _Shaft, inside: NDArray[np.bool_], least: float, contrast: float
     return NeedleEcho(pixel, covariance, contrast, None, np.stack([shaft.ends[0 if forward else 1], pixel]))
 
 
-def _off(shaft: _Shaft, tip: NeedleEcho, expected: Expected) -> float:
-    """Distance of a tip, or of the nearer end of a rejected shaft, from where it is expected, over the most that is near."""
-    ends = tip.pixel[None] if tip.found else shaft.ends
+def _off(ends: Array, expected: Expected) -> float:
+    """Distance of the nearer of ends : (n, 2) from where the tip is expected, over the most that is near."""
     sigma = np.sqrt(np.linalg.eigvalsh(expected.covariance).max())
     return float(np.linalg.norm(ends - expected.pixel, axis=1).min() / (NEAR_PX + SIGMAS * sigma))
 

@@ -173,16 +173,22 @@ def compare(
     tracked = rigid.apply(rigid.invert(probe.target_from_image), in_target)
     part = Clip(*settings.clip) if settings.clip else Clip(0, 0, *sweep.size)
     pixels = (tracked[:, :2] - [0, settings.tip_radius_mm]) / probe.scale - part.corner
+    directions: Sequence[Array | None] = [None] * len(poses)
+    if tip.axis is not None:
+        directions = np.einsum("nji,j->ni", poses[:, :3, :3], tip.axis) @ probe.target_from_image[:3, :2] / probe.scale
     tips = []
     for k, image in enumerate(watch.follow(sweep.images(), len(sweep.frames), "looking for the tip")):
-        expected = Expected(pixels[k], np.diag(probe.scale**-2.0)) if np.isfinite(pixels[k]).all() else None
+        expected = Expected(pixels[k], np.diag(probe.scale**-2.0), directions[k]) if np.isfinite(pixels[k]).all() else None
         seen = needle_echo.find(part.cut(image), settings.appearance, expected).shifted(part.corner)
         tips.append(_judged(seen, tracked[k, 2], settings.beside_mm))
     used = np.flatnonzero([one.found for one in tips])
     if len(used) < LEAST:
-        reason, count = Counter(one.reason.partition(":")[0] for one in tips if one.reason).most_common(1)[0]
-        way = f"; {WAYS[reason]}" if reason in WAYS else ""
-        found = f"found {len(used)} (most often: {reason}, {count} of {len(tips)}{way})"
+        reasons = Counter(one.reason.partition(":")[0] for one in tips if one.reason)
+        common = [
+            f" (most often: {reason}, {count} of {len(tips)}{f'; {WAYS[reason]}' if reason in WAYS else ''})"
+            for reason, count in reasons.most_common(1)
+        ]
+        found = f"found {len(used)}{''.join(common) or ' in all'}"
         raise InputError(f"{sweep.name}: expected {LEAST} B-scans or more with a pose and the tip, {found}")
     rates = tracks.rates_at(sweep.track, sweep.times, lag) if sweep.clocked else np.zeros((len(poses), 4, 4))
     alike = np.zeros((len(poses), 6, 6)) if shared is None else shared

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon.capture import probe_files, tip_files
+from recon.capture import probe_files, sweep_part, tip_files
 from recon.capture.manifest import SCANNER, Device
 from recon.capture.writer import new_capture
+from recon.errors import InputError
 from recon.freehand import sequences
 from recon.freehand.sequences import Frames
 from recon.geometry import rigid
@@ -19,6 +20,9 @@ from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES
 from recon.model.tip import Tip
 from recon.model.tracks import Track
+from recon.probe_calibration import needle_echo, sound_in_water
+from recon.session import tip_comparison_step
+from recon.session.tip_comparison_step import Settings
 from sonotwin.cli import main
 from tests.recon import needle_scans, stylus_motions, sweep_sets
 from tests.recon.probe_motions import true_probe
@@ -93,6 +97,37 @@ def test_a_needle_as_it_is_calibrated_is_where_tracking_has_it(source, recording
         rows = list(csv.DictReader(stream))
     off = [np.hypot(float(row["off_x_mm"]), float(row["off_y_mm"])) for row in rows if row["status"] == "used"]
     assert len(rows) == COUNT and np.median(off) == pytest.approx(figures["off_median_mm"], abs=1e-3)
+
+
+@pytest.fixture
+def compare(recording):
+    """The comparison by some of the recording's B-scans, and a tip."""
+    sweep = sweep_part.read_sweep(recording / "capture", purpose="volume").from_body("needle")
+    settings = Settings(capture=recording, tip=recording, tip_radius_mm=needle_scans.RADIUS_MM)
+    probe = sound_in_water.for_tissue(sweep.probe, 1488.3)
+
+    def of(chosen, tip):
+        some = replace(sweep, paths=tuple(sweep.paths[k] for k in chosen), frames=sweep.frames[chosen], times=sweep.times[chosen])
+        return tip_comparison_step.compare(some, probe, tip, settings)
+
+    return of
+
+
+def test_too_few_b_scans_that_all_show_the_tip_are_refused(compare, recording):
+    tip = tip_files.read(recording / "tip.yaml")
+    used = compare(np.arange(COUNT), tip).used
+    with pytest.raises(InputError, match=r"expected 5 B-scans or more with a pose and the tip, found 4 in all$"):
+        compare(used[:4], tip)
+
+
+def test_the_shaft_is_looked_for_along_the_tips_axis(compare, monkeypatch, rig):
+    """The needle's shaft points to -z of its target, dips as drawn, pixels aren't square, and are drawn for 1540 m/s."""
+    given, find = [], needle_echo.find
+    monkeypatch.setattr(needle_echo, "find", lambda *args: given.append(args[2].direction) or find(*args))
+    compare(np.arange(COUNT), Tip(TIP, np.diag([TIP_MM**2] * 3 + [0.0] * 3), axis=np.array([0.0, 0.0, -1.0])))
+    dips = poses(np.random.default_rng(11), true_probe(rig))[1]
+    along, down = (np.array(given) * needle_scans.SCALE * [1, 1488.3 / 1540]).T
+    assert np.abs(np.degrees(np.arctan2(down, along)) - dips).max() < 0.3
 
 
 @pytest.mark.parametrize(("given", "said"), [

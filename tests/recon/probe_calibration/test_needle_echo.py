@@ -1,5 +1,7 @@
 """A needle's tip is found where it is, whatever is expected, and what shows none is told apart."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,12 +66,19 @@ def test_of_a_shaft_with_both_ends_in_the_image_the_deeper_one_is_the_tip_or_the
     tail = TIP - 16 * np.array([np.cos(np.radians(25)), np.sin(np.radians(25)), 0])
     back = Expected(echo_of(tail, "water"), np.eye(2), np.array([-0.9, -0.4]))
     near(needle_echo.find(scan, None, back), echo_of(tail, "water"), 0.6)
+    near(needle_echo.find(scan, None, replace(back, direction=None)), echo_of(tail, "water"), 0.6)
 
 
 def test_a_shaft_across_the_plane_is_a_spot():
     found = needle_echo.find(image("water", rod(TIP, 10.0, 75.0)))
     near(found, echo_of(TIP, "water"), 0.3)
     assert found.shaft is None
+
+
+def test_a_spot_far_from_where_tracking_has_the_tip_is_none():
+    scan, pixel = image("water", rod(TIP, 10.0, 75.0)), echo_of(TIP, "water")
+    assert needle_echo.find(scan, None, Expected(pixel + np.array([0, 15 * MM_PX]), np.eye(2))).reason == needle_echo.FAR
+    near(needle_echo.find(scan, None, Expected(pixel + np.array([0, 3 * MM_PX]), np.eye(2))), pixel, 0.3)
 
 
 @pytest.mark.parametrize(("wires", "reason"), [
