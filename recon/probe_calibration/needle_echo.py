@@ -45,7 +45,7 @@ FAR = "no tip near where tracking has it"  # reason of a rejection
 HALF_DB = 6.0  # below the shaft's level, at the tip: half of the amplitude
 LEVEL_PX = (8, 40)  # before the end, between which the shaft's level is taken
 FADE_DB, FADE_PX = 15.0, 17.0  # beyond the tip the echo falls by this within this way; a slower one fades out of the plane
-SPOT_PX = 8  # before the end of a bevel, where the spot of its tip is
+SPOT_PX = 8  # before the end of a bevel, within which the last peak is its tip; facets behind it may be as bright
 EDGE_PX = 5.0  # such a way of an even shaft
 OUTSIDE_DB = -1e3
 GRAIN_PX = 5.0  # length with one independent level
@@ -306,8 +306,10 @@ def _tip(shaft: _Shaft, inside: NDArray[np.bool_], least: float, contrast: float
         return _none(f"fades out over {way:.0f} px: the tip isn't in the image's plane", contrast)
     aside = shaft.aside_px if forward else shaft.aside_px[::-1]
     if abs(aside[last]) > CORE_PX:  # the end of a bevel, which is seen by what it diffracts: a spot
-        start = max(last - SPOT_PX, begin)
-        place = float(start + levels[start : last + 1].argmax())
+        start = max(last - SPOT_PX, begin + 1)
+        near = levels[start - 1 : last + 2]
+        peaks = np.flatnonzero((near[1:-1] >= near[:-2]) & (near[1:-1] >= near[2:]))
+        place = float(start + (peaks[-1] if len(peaks) else near[1:-1].argmax()))
     else:
         place = last + (levels[last] - half) / max(levels[last] - levels[last + 1], 1e-6)
     pixel = shaft.pixel(place if forward else len(levels) - 1 - place)
