@@ -238,7 +238,8 @@ def calibrate(
     sightings = _with_wires(estimate, sightings, inliers)
     if sightings.beside is not None:
         estimate, inliers, factor = _without_outliers(estimate, sightings, noise)
-    rms = float(np.sqrt((_residuals(estimate, sightings.of(inliers)) ** 2).sum(axis=1).mean()))
+    counted = inliers if inliers.any() else ~inliers
+    rms = float(np.sqrt((_residuals(estimate, sightings.of(counted)) ** 2).sum(axis=1).mean()))
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
         _say_why(sightings, noise, rms, factor, inliers, _farthest(estimate, sightings, numbers))
     slopes, left = _whitened(estimate, sightings, noise)

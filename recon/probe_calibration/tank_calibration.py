@@ -68,7 +68,7 @@ class Settings(Part):
     """mm, of stylus: by which its echo comes from before the tip: the radius of a ball, or of a shaft that is cut off square"""
     tip_radius_sigma_mm: NotNegative = 0.05
     """mm, its standard deviation; assumed"""
-    sphere_radius_mm: Annotated[float, Field(gt=0, le=500)] | None = None
+    sphere_radius_mm: Annotated[float, Field(ge=1, le=500)] | None = None
     """mm, of sphere, which needs it"""
     sphere_radius_sigma_mm: Annotated[float, Field(gt=0, le=10)] = 0.05
     """mm, its standard deviation, which goes into the depth; assumed, of callipers"""

@@ -30,7 +30,7 @@ def read(settings: Settings, reference: str | None) -> tuple[float, float]:
     """The radius, mm, and its standard deviation."""
     del reference
     if settings.sphere_radius_mm is None:
-        raise InputError("sphere_radius_mm: expected the sphere's radius in mm, found none")
+        raise InputError("sphere_radius_mm: expected the sphere's radius in mm, found none; give sphere_radius_mm=")
     return settings.sphere_radius_mm, settings.sphere_radius_sigma_mm
 
 
