@@ -139,9 +139,10 @@ def from_body(track: Track, body: Track) -> Track:
     Tolerances that both share, as those of the cameras, count twice, so that the shared part is no less than it is.
     """
     if not np.array_equal(track.times, body.times):
-        shares = np.nan_to_num(shares_at(body, track.times, 0.0))
+        numbers, shares = neighbours_at(body, track.times, 0.0)
+        shares = np.nan_to_num(shares)
         own, alike = (
-            None if each is None else np.einsum("nm,mij->nij", weights, each[body.found])
+            None if each is None else np.einsum("nk,nkij->nij", weights, each[numbers])
             for each, weights in ((body.covariance, shares**2), (body.shared, shares))
         )
         body = Track(track.times, at(body, track.times), own, alike)
@@ -154,20 +155,35 @@ def _inverse(pose: Array) -> Array:
     return rigid.invert(pose) if np.isfinite(pose).all() else np.full((4, 4), np.nan)
 
 
+def neighbours_at(track: Track, times: NDArray[np.int64], lag_s: float) -> tuple[NDArray[np.intp], Array]:
+    """Numbers : (n, 2) in the track of the poses of which `poses_at` makes those at n times, and their weights : (n, 2).
+
+    Weights are NaN outside of the track. Of a track of one pose, the second weight is 0.
+    """
+    found = np.flatnonzero(track.found)
+    wanted = np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9))
+    if len(found) < 2:
+        numbers, shares = np.zeros((len(wanted), 2), np.intp), np.full((len(wanted), 2), np.nan)
+        if len(found):
+            numbers[:] = found
+            shares[np.abs(wanted - track.times[found]) <= SAME_S * 1e9] = 1.0, 0.0
+        return numbers, shares
+    moments = track.times[found]
+    after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
+    apart = moments[after] - moments[after - 1]
+    share, slack = (wanted - moments[after - 1]) / apart, SAME_S * 1e9 / apart
+    shares = np.column_stack([1 - share, share])
+    shares[(share < -slack) | (share > 1 + slack)] = np.nan
+    return found[np.column_stack([after - 1, after])], shares
+
+
 def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
     """Weights : (n, m) of the m poses that were found, of which `poses_at` makes those at n times; NaN outside of the track."""
-    moments = track.times[track.found]
-    wanted = np.asarray(times, np.int64) - np.int64(round(lag_s * 1e9))
-    shares = np.zeros((len(wanted), len(moments)))
-    if len(moments) < 2:
-        return np.where(np.abs(wanted[:, None] - moments) <= SAME_S * 1e9, 1.0, np.nan)
-    after = np.clip(np.searchsorted(moments, wanted), 1, len(moments) - 1)
-    share = (wanted - moments[after - 1]) / (moments[after] - moments[after - 1])
-    rows = np.arange(len(wanted))
-    shares[rows, after - 1], shares[rows, after] = 1 - share, share
-    slack = SAME_S * 1e9 / (moments[after] - moments[after - 1])
-    shares[(share < -slack) | (share > 1 + slack)] = np.nan
-    return shares
+    numbers, weights = neighbours_at(track, times, lag_s)
+    shares = np.zeros((len(weights), len(track.times)))
+    np.add.at(shares, (np.arange(len(weights))[:, None], numbers), weights)
+    shares[np.isnan(weights).any(axis=1)] = np.nan
+    return shares[:, track.found]
 
 
 def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:

@@ -41,10 +41,15 @@ class Lateness:
         return abs(self.seconds) > max(SURE * self.sigma_s, NO_LAG_S)
 
     @property
-    def described(self) -> str:
-        """The lag, and the way on."""
+    def corrected(self) -> str:
+        """The lag, and what to add to it."""
         off = f"{'late' if self.seconds > 0 else 'early'} by {1e3 * abs(self.seconds):.0f} ± {1e3 * self.sigma_s:.0f} ms"
-        return f"the B-scans are {off} beyond lag_s: add {self.seconds:+.3f} to it, or give lag_s=free, or hold still"
+        return f"the B-scans are {off} beyond lag_s: add {self.seconds:+.3f} to it"
+
+    @property
+    def described(self) -> str:
+        """The lag, and the ways on of a phantom that serves to find it."""
+        return f"{self.corrected}, or give lag_s=free, or hold still"
 
 
 def figures(late: Lateness | None) -> Metrics:

@@ -45,7 +45,8 @@ from recon.estimation.parameters import Blocks
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
-from recon.probe_calibration import movement, point_calibration, probe_checks
+from recon.probe_calibration import lateness, movement, point_calibration, probe_checks
+from recon.probe_calibration.lateness import Lateness
 from recon.probe_calibration.movement import PROBE, FrameEquations, Movement
 from recon.probe_calibration.point_calibration import MAX_FACTOR, MAX_RMS_MM, MIN_INLIERS, NAMED, Noise
 
@@ -70,9 +71,8 @@ REFINED = 6  # starts that are refined, the best
 REFINE = Rules(steps=8)  # of these, which need not converge
 STEEPEST, FLATTEST = 0.95, 0.3  # sine of a tilt across the plane, at most; cosine of one between beam and normal, at least
 LEAST, LEAST_LEVEL = 1e-12, 1e-3  # measured noise over the assumed: exact numbers have none
-SURE, LIKELY = 5.0, 3.0  # standard deviations from which on an unusual value is told, of a sphere's radius beside others
+SURE, LIKELY = 5.0, 3.0  # standard deviations from which on another radius of a sphere is refused, or told
 BENDS = 0.01  # of a radius, by which speckle on its slopes may bend all arcs alike
-NO_LAG_S = 0.005  # lag that isn't worth a word
 LIKELY_MM = 0.5  # from the surface, of points that are read rightly
 LAGS_S = np.array([-0.28, -0.24, -0.2, -0.16, -0.12, -0.08, -0.04, 0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28])  # tried
 MOST_TRIED, REFINED_TRIED = 40, 2  # frames and starts, of a refusal
@@ -262,10 +262,13 @@ class _Estimate:
         """The image's axes : (n, 3, 3) in the world, columns."""
         return poses[:, :3, :3] @ self.target_from_image[:3, :3]
 
+    def points(self, frames: CurveSightings) -> Array:
+        """Places : (n, k, 3) mm of the points' pixels in the target's frame."""
+        return (frames.pixels * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
+
     def arms(self, frames: CurveSightings) -> Array:
         """Vectors : (n, k, 3) mm, along the world's axes, from the target's origin to the points' pixels."""
-        plane = (frames.pixels * self.scale) @ self.target_from_image[:3, :2].T + self.target_from_image[:3, 3]
-        return plane @ np.swapaxes(frames.poses[:, :3, :3], 1, 2)
+        return self.points(frames) @ np.swapaxes(frames.poses[:, :3, :3], 1, 2)
 
     def places(self, frames: CurveSightings) -> Array:
         """Places : (n, k, 3) mm of the points' pixels in the world."""
@@ -279,7 +282,8 @@ class _Linear:
     distances: Array  # (n, k) mm
     by_place: Array  # (n, k, 3)
     slopes: Array  # (n, k, g) by `_unknowns`
-    covariance: Array  # (n, k, k) mm^2
+    by_poses: Array  # (n, k, k) mm^2, covariance by noise of the poses
+    covariance: Array  # (n, k, k) mm^2, with all other
 
 
 def _unknowns(surface: Surface) -> Blocks:
@@ -326,10 +330,10 @@ def _linear(estimate: _Estimate, frames: CurveSightings, noise: Noise) -> _Linea
     slopes[..., blocks["surface"]] = surface.slopes(places) + by_sine * by_surface
     slopes[..., blocks["echo"]] = along[..., None] * np.stack([deeper, slope], axis=-1)
     pose = noise.of_pose if frames.pose_covariance is None else frames.pose_covariance
-    by_pose = (normals[..., None, :] @ rigid.slopes(arms))[..., 0, :]
+    by_poses = propagate((normals[..., None, :] @ rigid.slopes(arms))[..., 0, :], pose)
     by_row = along * estimate.scale[1]
-    covariance = propagate(by_pose, pose) + by_row[..., None] * frames.row_covariance * by_row[:, None] + SURFACE_MM**2
-    return _Linear(surface.distances(places), normals, slopes, covariance + point_calibration.FLOOR_MM**2 * np.eye(k))
+    covariance = by_poses + by_row[..., None] * frames.row_covariance * by_row[:, None] + SURFACE_MM**2
+    return _Linear(surface.distances(places), normals, slopes, by_poses, covariance + point_calibration.FLOOR_MM**2 * np.eye(k))
 
 
 def _whitened(estimate: _Estimate, frames: CurveSightings, noise: Noise) -> tuple[Array, Array]:
@@ -496,8 +500,8 @@ class SurfaceAdjustment:
     noise_factor: float  # measured noise over the assumed
     mirror: tuple[float, float]  # share of a mirror in the echo, and its standard deviation
     radius: tuple[float, float]  # mm, of a sphere, by the arcs alone, and its standard deviation; NaN of a wall
-    more_lag_s: tuple[float, float]  # of the B-scans, beyond that of the poses, and its standard deviation; NaN if unknown
     held_out_mm: float  # RMS of frames of half of them, by the other half
+    late: Lateness | None = None  # of the B-scans, beyond the lag of the poses; None without times
     moved: Movement | None = None  # of the probe or the phantom, which the covariance allows for
     persistence: float = 1.0  # frames that count as one in the covariance, as residuals of neighbours are alike
 
@@ -523,8 +527,8 @@ class SurfaceAdjustment:
             yield f"by arcs and motion the sphere's radius is {radius:.2f} ± {sigma:.2f} mm, given {self.surface.given[0]:g}"
         if self.moved is not None:
             yield _described(self.moved)
-        if _is_late(self.more_lag_s):
-            yield _described_lag(self.more_lag_s)
+        if self.late is not None and self.late.shown:
+            yield _described_lag(self.late)
 
 
 def _off(found: tuple[float, float], given: tuple[float, float], sigmas: float) -> bool:
@@ -541,15 +545,8 @@ def _rms(distances: Array) -> float:
     return float(np.sqrt((distances**2).mean()))
 
 
-def _is_late(more_lag_s: tuple[float, float]) -> bool:
-    """Whether a lag is worth a word, by its standard deviation."""
-    return abs(more_lag_s[0]) > max(SURE * more_lag_s[1], NO_LAG_S)
-
-
-def _described_lag(more_lag_s: tuple[float, float]) -> str:
-    lag, sigma = more_lag_s
-    off = f"{'late' if lag > 0 else 'early'} by {1e3 * abs(lag):.0f} ± {1e3 * sigma:.0f} ms"
-    return f"the B-scans are {off} beyond lag_s: add {lag:+.3f} to it, or hold still"
+def _described_lag(late: Lateness) -> str:
+    return f"{late.corrected}, or hold still"
 
 
 def _described(moved: Movement) -> str:
@@ -605,7 +602,7 @@ def calibrate(
     equations = FrameEquations(slopes, left, blocks["probe"], place, _known(estimate)[0])
     spread = inverse(_information(equations, inliers))
     by_arcs = _radius(estimate, spread)
-    lag = _more_lag(estimate, sightings, noise, equations, inliers, spread)
+    late = None if sightings.pose_rates is None else _lateness(estimate, used, noise, level)
     if radius is not None and _off(by_arcs, radius, SURE):
         _refuse_reading(sightings, radius, noise, min(LIKELY_MM, rms))
         found = f"{radius[0]:g} mm, where the arcs and the motion make it {by_arcs[0]:.2f} ± {by_arcs[1]:.2f} mm"
@@ -616,14 +613,14 @@ def calibrate(
     step, covariance = movement.average(equations, solved, inliers, alike=alike)
     estimate = estimate.moved(Step(step, np.zeros((0, 0))))
     covariance = covariance[: len(NAMES), : len(NAMES)].copy()
-    if lag[2] is not None and sightings.lag_sigma_s:
-        covariance = covariance + sightings.lag_sigma_s**2 * np.outer(lag[2], lag[2])
+    if late is not None:
+        covariance += sightings.lag_sigma_s**2 * np.outer(late.change, late.change)
     try:
         there, weak = sightings.of(inliers), _weak(estimate, sightings.of(inliers), size)
         middles = _Middles(there.poses, there.pixels.mean(axis=1))
         probe_checks.certainty(estimate.target_from_image, estimate.scale, covariance, middles, size, max_sigma_mm, weak)
     except InputError as error:
-        also = _described_lag(lag[:2]) if _is_late(lag[:2]) else "" if moved is None else _described(moved)
+        also = _described_lag(late) if late is not None and late.shown else "" if moved is None else _described(moved)
         raise InputError(f"{error}; {also}" if also else str(error)) from None
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     calibration = ProbeCalibration(estimate.target_from_image, estimate.scale, uncertainty)
@@ -637,8 +634,8 @@ def calibrate(
         level,
         (estimate.mirror, float(np.sqrt(spread[blocks["echo"], blocks["echo"]][0, 0]))),
         by_arcs,
-        lag[:2],
         _held_out(estimate, sightings.of(inliers), noise, level),
+        late,
         moved,
         alike,
     )
@@ -669,28 +666,17 @@ def _radius(estimate: _Estimate, spread: Array) -> tuple[float, float]:
     return (whole * surface.radius - known * given) / alone, alone**-0.5
 
 
-def _more_lag(
-    estimate: _Estimate, frames: CurveSightings, noise: Noise, equations: FrameEquations, used: Mask, spread: Array
-) -> tuple[float, float, Array | None]:
-    """Lag of the B-scans that the residuals show, s, its standard deviation, and the calibration's change : (8,) a second of it.
-
-    NaN and None without times, or at rest.
-    """
-    rates = frames.pose_rates
-    if rates is None or not np.abs(rates).any():
-        return np.nan, np.nan, None
+def _lateness(estimate: _Estimate, frames: CurveSightings, noise: Noise, level: float) -> Lateness:
+    """Lag of the B-scans that the residuals of frames that aren't outliers show; a level of noise over the assumed."""
+    assert frames.pose_rates is not None
     linear = _linear(estimate, frames, noise)
-    plane = (frames.pixels * estimate.scale) @ estimate.target_from_image[:3, :2].T + estimate.target_from_image[:3, 3]
-    motion = plane @ np.swapaxes(rates[:, :3, :3], 1, 2) + rates[:, None, :3, 3]
-    whiten = whitening(linear.covariance * _level(estimate, frames.of(used), noise) ** 2)
-    column = (whiten @ -(linear.by_place * motion).sum(axis=-1)[..., None])[used].reshape(-1)
-    rows, left = equations.slopes[used].reshape(len(column), -1), equations.residuals[used].ravel()
-    change = -spread @ (rows.T @ column)
-    more = column + rows @ change
-    information = float(column @ more)
-    if information < 1e-9 * float(column @ column):
-        return 0.0, np.inf, change[: len(NAMES)]
-    return -float(more @ left) / information, information**-0.5, change[: len(NAMES)]
+    whiten, rates = whitening(linear.covariance), frames.pose_rates
+    motion = estimate.points(frames) @ np.swapaxes(rates[:, :3, :3], 1, 2) + rates[:, None, :3, 3]
+    column = (whiten @ -(linear.by_place * motion).sum(axis=-1)[..., None])[..., 0] / level
+    slopes, left = (each / level for each in _whitened(estimate, frames, noise))
+    by_poses = float(np.trace(propagate(whiten, linear.by_poses), axis1=1, axis2=2).sum())
+    counted = np.full(len(left), left.shape[1])
+    return lateness.of_residuals(column, left, slopes, _known(estimate)[0], counted, level, by_poses)
 
 
 def _weak(estimate: _Estimate, frames: CurveSightings, size: Size) -> dict[str, float]:

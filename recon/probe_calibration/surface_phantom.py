@@ -47,8 +47,8 @@ def figures(found: SurfaceAdjustment) -> Metrics:
         "radius_by_arcs_mm": found.radius[0],
         "radius_by_arcs_sigma_mm": found.radius[1],
         "frames_that_count_as_one": found.persistence,
-        "more_lag_s": found.more_lag_s[0],
-        "more_lag_sigma_s": found.more_lag_s[1],
+        "more_lag_s": np.nan if found.late is None else found.late.seconds,
+        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
     }
 
 

@@ -1,5 +1,7 @@
 """A track in a reference's frame: the motion of the reference is undone, and its errors are in the covariance."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -105,3 +107,36 @@ def test_a_body_of_other_moments_is_interpolated(rng):
     assert found.found.tolist() == [True, True, False]
     assert np.allclose(found.poses[0, :3, 3], held[:3, :3].T @ [-5.0, 0, 0])
     assert np.allclose(found.covariance[0, :3, :3], np.eye(3) / 2)
+
+
+def test_a_body_that_was_lost_for_a_moment_has_the_noise_of_the_poses_around(rng):
+    """Weights of all pairs of moments give the same; what errs alike isn't averaged."""
+    count = 30
+    body = Track(np.arange(count) * 10**7, poses(rng, count), covariances(rng, count), covariances(rng, count))
+    body.poses[[4, 11, 12]] = np.nan
+    still = np.repeat(np.eye(4)[None], count, axis=0)
+    times = np.sort(rng.integers(0, (count - 1) * 10**7, count))
+    found = tracks.from_body(Track(times, still, np.zeros((count, 6, 6)), np.zeros((count, 6, 6))), body)
+    shares = tracks.shares_at(body, times, 0.0)
+    own, alike = (np.einsum("nm,mij->nij", *each) for each in (
+        (shares**2, body.covariance[body.found]), (shares, body.shared[body.found])
+    ))  # fmt: skip
+    there = Track(times, tracks.at(body, times), own, alike)
+    expected = tracks.from_body(Track(times, still, np.zeros((count, 6, 6)), np.zeros((count, 6, 6))), there)
+    assert np.allclose(found.covariance, expected.covariance, rtol=1e-9) and np.allclose(found.shared, expected.shared, rtol=1e-9)
+
+
+def test_minutes_of_another_body_take_no_matrix_of_all_pairs_of_moments():
+    """Memory grows with the moments, not with their square."""
+    count = 3000
+    body, moved = (
+        Track(np.arange(count) * 10**7 + later, np.repeat(np.eye(4)[None], count, axis=0), np.tile(np.eye(6), (count, 1, 1)))
+        for later in (0, 10**6)
+    )
+    tracemalloc.start()
+    try:
+        tracks.from_body(moved, body)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 8 * count**2

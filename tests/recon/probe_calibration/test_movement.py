@@ -188,3 +188,22 @@ def test_frames_that_turn_out_to_be_right_count_as_if_they_had_been_used(rng):
     expected, same = movement.average(together, ALL, ALL)
     np.testing.assert_allclose(back + step, back_together + expected, atol=1e-9)
     np.testing.assert_allclose(covariance, same, rtol=1e-6, atol=1e-12)
+
+
+def test_a_movement_is_found_by_two_residuals_a_frame(rng):
+    """As a wall's line has, of frames that are no multiple of three."""
+    count = 20
+    slopes = WEIGHTS * rng.standard_normal((count, 2, UNKNOWNS))
+    growth = np.zeros(UNKNOWNS)
+    growth[BY_PROBE] = movement.PROPORTIONS @ rng.standard_normal(6)
+    noise, course = rng.standard_normal((count, 2)), np.linspace(-1, 1, count)[:, None]
+    found = []
+    for left in (noise, noise - course * (slopes @ growth)):
+        flat = slopes.reshape(-1, UNKNOWNS)
+        step = -np.linalg.lstsq(flat, left.ravel())[0]
+        equations = FrameEquations(slopes, left + slopes @ step, BY_PROBE, BY_WIRES, np.zeros(UNKNOWNS))
+        found.append(movement.find(equations, np.ones(count, bool)))
+    still, moved = found
+    assert still is None and moved.what == movement.PROBE
+    np.testing.assert_allclose(moved.growth, growth[BY_PROBE], atol=0.3 * np.abs(growth).max())
+    assert moved.alike == 1

@@ -2,12 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import chdtri
 
 from recon.errors import InputError
 from recon.estimation.equations import Step
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration import point_calibration, probe_checks, surface_calibration
+from recon.probe_calibration.lateness import RATE_S
 from recon.probe_calibration.point_calibration import Noise
 from recon.probe_calibration.surface_calibration import CurveSightings, Wall
 from tests.recon import surface_sights
@@ -203,9 +205,32 @@ def test_a_small_lag_is_told_with_its_size(surface, radius, rig, rng):
     """20 ms at 20 mm/s: less than the noise of a frame."""
     seen = late(surface_sights.observe(true_probe(rig), surface, rng), 0.02)
     found = surface_calibration.calibrate(seen, SIZE, radius)
-    lag, sigma = found.more_lag_s
-    assert sigma < 0.002 and abs(lag - 0.02) < 4 * sigma
+    assert found.late.sigma_s < 0.002 and abs(found.late.seconds - 0.02) < 4 * found.late.sigma_s
     assert any("the B-scans are late by" in doubt for doubt in found.doubts())
+
+
+@pytest.mark.parametrize(("surface", "radius"), KINDS, ids=NAMES)
+def test_a_probe_at_rest_leaves_the_lag_open(surface, radius, rig, rng):
+    """Rates of noise alone, of poses 0.1 s apart, would seem to tell it to 10 ms."""
+    seen = surface_sights.observe(true_probe(rig), surface, rng)
+    before, after = (surface_sights.noisy(seen.poses, seen.pixels, rng).poses for _ in range(2))
+    found = surface_calibration.calibrate(replace(seen, pose_rates=(after - before) / (2 * RATE_S)), SIZE, radius)
+    assert found.late.sigma_s > 0.03 and not found.late.shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("surface", "radius"), KINDS, ids=NAMES)
+def test_sigma_of_the_lag_is_its_error(surface, radius, rig):
+    """Of 30 sets with rates that have the noise of two poses; a larger lag would count as noise, too."""
+    probe, noise, squared = true_probe(rig), Noise(surface_sights.ANGLE_DEG, surface_sights.POSITION_MM), 0.0
+    for k in range(30):
+        rng = np.random.default_rng([k, 9])
+        seen = late(surface_sights.observe(probe, surface, rng), 0.001)
+        before, after = (surface_sights.noisy(seen.poses, seen.pixels, rng).poses for _ in range(2))
+        rates = seen.pose_rates + (after - before) / (2 * RATE_S)
+        found = surface_calibration.calibrate(replace(seen, pose_rates=rates), SIZE, radius, noise, max_sigma_mm=5.0).late
+        squared += ((found.seconds - 0.001) / found.sigma_s) ** 2
+    assert chdtri(30, 1 - 1e-4) < squared < chdtri(30, 1e-4)
 
 
 @pytest.mark.parametrize(("surface", "radius"), KINDS, ids=NAMES)
@@ -218,6 +243,7 @@ def test_a_slipping_bracket_is_told(surface, radius, rig, rng):
     seen = surface_sights.noisy(poses, np.concatenate([before[:50], after[50:]]), rng)
     found = surface_calibration.calibrate(seen, SIZE, radius, max_sigma_mm=20.0)
     assert any("the probe moved against its target" in doubt for doubt in found.doubts())
+    assert found.persistence < 1.5  # what is left has the noise of each frame alone
     covariance = point_calibration.point_covariance(found.calibration, NINE)
     off = [away(found.calibration, each) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) for each in (probe, slipped)]
     assert max(np.sqrt(np.mean(each**2)) for each in off) < 2
