@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.files.metrics import Metrics
-from recon.probe_calibration import surface_calibration
+from recon.probe_calibration import lateness, surface_calibration
 from recon.probe_calibration.echo_curve import Curve
 from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.surface_calibration import CurveSightings, SurfaceAdjustment
@@ -47,8 +47,7 @@ def figures(found: SurfaceAdjustment) -> Metrics:
         "radius_by_arcs_mm": found.radius[0],
         "radius_by_arcs_sigma_mm": found.radius[1],
         "frames_that_count_as_one": found.persistence,
-        "more_lag_s": np.nan if found.late is None else found.late.seconds,
-        "more_lag_sigma_s": np.nan if found.late is None else found.late.sigma_s,
+        **lateness.figures(found.late),
     }
 
 
