@@ -19,6 +19,10 @@ from recon.probe_calibration.phantom_frames import CROSSED_WIRES, PHANTOMS, STYL
 from recon.probe_calibration.point_calibration import Noise
 
 Phantom = Annotated[str, PlainValidator(partial(registry.known, PHANTOMS))]
+OWN = {  # fields that one phantom alone has
+    STYLUS: ("tip", "tip_radius_mm", "tip_radius_sigma_mm"),
+    "sphere": ("sphere_radius_mm", "sphere_radius_sigma_mm"),
+}
 ORDINARY_C = 22.0  # of water, where no temperature is given
 SAME_WIDTH = 0.05  # relative difference of sx, which no sound changes, within which a B-scan is of the rig's scanner
 
@@ -121,16 +125,13 @@ class Settings(Part):
         return self
 
     @model_validator(mode="after")
-    def _of_a_stylus(self) -> "Settings":
-        if self.tip is not None and self.phantom != STYLUS:
-            raise ValueError(f"tip: expected none with phantom={self.phantom}, found {self.tip}: phantom={STYLUS}?")
-        return self
-
-    @model_validator(mode="after")
-    def _of_a_sphere(self) -> "Settings":
-        if self.sphere_radius_mm is not None and self.phantom != "sphere":
-            expected = f"sphere_radius_mm: expected none with phantom={self.phantom}"
-            raise ValueError(f"{expected}, found {self.sphere_radius_mm:g}: phantom=sphere?")
+    def _of_one_phantom(self) -> "Settings":
+        for phantom, names in OWN.items():
+            for name in names:
+                value = getattr(self, name)
+                if self.phantom != phantom and value != type(self).model_fields[name].default:
+                    found = f"{value:g}" if isinstance(value, float) else value
+                    raise ValueError(f"{name}: expected none with phantom={self.phantom}, found {found}: phantom={phantom}?")
         return self
 
     @property

@@ -28,7 +28,7 @@ from recon.model.tracks import FreeLagSeconds
 from recon.probe_calibration import free_lag, latency, lateness, phantom_frames, probe_figures, sound_in_water, tank_calibration
 from recon.probe_calibration.free_lag import FreeLag
 from recon.probe_calibration.lateness import Lateness
-from recon.probe_calibration.phantom_frames import NO_POSE, PHANTOMS, PhantomFrames
+from recon.probe_calibration.phantom_frames import NO_POSE, PHANTOMS, STYLUS, PhantomFrames
 from recon.probe_calibration.point_calibration import Noise
 from recon.probe_calibration.tank_calibration import Result
 from recon.registry import Choice
@@ -230,7 +230,8 @@ def at_lag(frames: PhantomFrames, sweep: Sweep, lag_s: float, lag_sigma_s: float
     covariance = sweep.pose_covariance(lag_s)
     if covariance is None:  # between two poses half as much
         shares = np.nan_to_num(tracks.shares_at(sweep.track, sweep.times, lag_s), nan=1.0)
-        covariance = (shares**2).sum(axis=1)[:, None, None] * noise.of_pose
+        own = noise.from_body(poses) if frames.phantom == STYLUS else noise.of_pose
+        covariance = (shares**2).sum(axis=1)[:, None, None] * own
     turns = moving[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)
     motion = np.column_stack([turns[:, 2, 1], turns[:, 0, 2], turns[:, 1, 0], moving[:, :3, 3]])
     covariance = covariance + jitter_s**2 * motion[:, :, None] * motion[:, None]

@@ -28,6 +28,7 @@ from recon.probe_calibration import needle_echo, sound_in_water
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.needle_echo import Expected, NeedleEcho
 from recon.probe_calibration.point_calibration import NO_POSE, Noise
+from recon.probe_calibration.probe_figures import NOISY
 from recon.session.watch import SILENT, Watch
 from recon.tip_calibration import imaged_tip
 from recon.tip_calibration.imaged_tip import LATE, PROBE, SOUND, TOOL, Comparison, Fault, Seen
@@ -103,12 +104,12 @@ class Compared:
     name: str  # of the source, for messages
     numbers: NDArray[np.int64]  # (n,) of the frames
     tips: tuple[NeedleEcho, ...]  # (n,)
-    used: NDArray[np.int64]  # (m,) places among them
+    used: NDArray[np.int64]  # (m,) places among them, those of outliers too
     comparison: Comparison  # of m
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> int:
-    """Find the tip in all B-scans, compare, and write; returns 1 if it isn't where tracking has it.
+    """Find the tip in all B-scans, compare, and write; returns 1 if it isn't where tracking has it, or scatters too much.
 
     Raises
     ------
@@ -128,7 +129,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> int:
         sweep_tables.write_rows(folder / FRAMES, HEADER, rows(found, probe))
         metrics.write(folder / metrics.FILE, figures)
     watch.say(f"wrote       {out}/{{{FRAMES},{metrics.FILE}}}")
-    return int(bool(found.comparison.named))
+    return int(bool(found.comparison.named) or found.comparison.level > NOISY)
 
 
 def _source(settings: Settings) -> tuple[SweepCapture | SequenceSweep, str]:
@@ -225,7 +226,8 @@ def measure(found: Comparison, count: int) -> Metrics:
     tool = found.faults[TOOL]
     return {
         "frames": count,
-        "frames_used": len(found.off),
+        "frames_outliers": int(found.outliers.sum()),
+        "frames_used": int((~found.outliers).sum()),
         "off_median_mm": float(np.median(found.distances)),
         "off_95_mm": float(np.percentile(found.distances, 95)),
         "tracked_sigma_mm": float(np.median(np.linalg.norm(found.tracked_sigma[:, :2], axis=1))),
@@ -246,7 +248,8 @@ def describe(found: Compared, figures: Metrics) -> Iterator[str]:
     reasons = Counter((one.reason or "").partition(":")[0] for one in found.tips)
     del reasons[""]
     left = "".join(f"; {count} {reason}" for reason, count in reasons.most_common(3))
-    yield f"find        the tip in {len(found.used)} of {len(found.tips)} B-scans{left}"
+    far = f", {figures['frames_outliers']} of them far from all others and left out" if figures["frames_outliers"] else ""
+    yield f"find        the tip in {len(found.used)} of {len(found.tips)} B-scans{far}{left}"
     plane = f"{figures['off_median_mm']:.2f} mm (median), {figures['off_95_mm']:.2f} mm (95 %)"
     known = f"tracking is known to {figures['tracked_sigma_mm']:.2f} mm (1 sigma)"
     yield f"off         imaged and tracked tip {plane} apart in the plane; {known}"
@@ -256,6 +259,10 @@ def describe(found: Compared, figures: Metrics) -> Iterator[str]:
     tool = [f"{figures[f'tool_{axis}_mm']:.2f} ± {figures[f'tool_sigma_{axis}_mm']:.2f}" for axis in "xyz"]
     yield f"systematic  {parts[0]} mm along the array, {parts[1]} mm in depth; in the tool's frame [{', '.join(tool)}] mm"
     yield f"scatter     about that {figures['noise_factor']:.2f} times the predicted"
+    if not found.comparison.named and found.comparison.level > NOISY:
+        cause = "other echoes than the tip's, poses of more noise than assumed, or clocks that differ?"
+        yield f"warning     no verdict: a scatter of over {NOISY:g} times the predicted hides what may be off: {cause}"
+        return
     if not found.comparison.named:
         yield "verdict     within what tracking, tip and probe are known to"
         return
@@ -273,4 +280,5 @@ def rows(found: Compared, probe: ProbeCalibration) -> Iterator[Sequence[object]]
         m = place[k]
         pixels = [f"{value:.2f}" for value in (*tip.pixel, *(comparison.tracked[m, :2] / probe.scale))]
         lengths = [f"{value:.4f}" for value in (*comparison.off[m], comparison.tracked[m, 2], *comparison.tracked_sigma[m])]
-        yield number, "used", *pixels, *lengths, f"{comparison.normalised[m]:.3f}", ""
+        status = "outlier" if comparison.outliers[m] else "used"
+        yield number, status, *pixels, *lengths, f"{comparison.normalised[m]:.3f}", ""

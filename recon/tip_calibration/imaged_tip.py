@@ -5,7 +5,9 @@ Its noise differs from frame to frame; what the calibrations leave open errs ali
 covariances. Beyond these, four faults leave a mark each: a tip that lies elsewhere in the tool's frame, by a bent shaft or
 another calibration; a probe that lies elsewhere in its target's frame; another speed of sound, by the depth; and B-scans that
 are late, by the tip's motion in the image. Each is fitted by itself, and the one that explains most, by Schwarz's criterion, is
-named.
+named. Chances are those of chi-square, or of F where the noise is more than predicted and so measured by the residuals.
+
+Frames whose tip is far from all others' are outliers, by residuals about the robust fit of the fault that explains most.
 
 How far the tip lies out of the plane isn't seen in a B-scan: of that, the tracked distance alone is known.
 """
@@ -16,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, fdtrc
 
 from recon.estimation.covariance import inverse, propagate, root, whitening
 from recon.estimation.persistence import persistence
@@ -25,9 +27,14 @@ from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.tip import TIP, Tip
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 CHANCE = 1e-3  # of a fault as large by what is left open, below which it is named
 LIKE = 6.0  # of Schwarz's criterion, within which another fault may be it as well
+FAR = 4.7  # standard deviations, beyond which a frame is an outlier
+TYPICAL = np.sqrt(2 * np.log(2))  # median length of two normal numbers
+LEAST_FRAMES = 12  # with fewer an outlier can't be told from noise that is more than predicted
+ROUNDS, LEAST_LENGTH = 30, 0.1  # of a robust fit; of a residual that is none
 TOOL, PROBE, SOUND, LATE = "tool", "probe", "sound", "late"  # faults
 
 
@@ -48,7 +55,10 @@ class Seen(NamedTuple):
 class Fault(NamedTuple):
     """A fault that was fitted, and the chance of as much without it."""
 
-    values: Array  # (k,) of a tool: the imaged tip less that of its file, mm in its frame; of sound: depth too large; of a lag: s
+    values: (
+        Array  # (k,) of a tool: the imaged tip less that of its file, mm in its frame; of a probe: its turn and shift since its
+    )
+    # file, rad and mm, as of rigid.moved; of sound: depth too large; of a lag: s
     covariance: Array  # (k, k) with what the calibrations leave open
     chance: float
     criterion: float  # Schwarz's, of the residuals that it leaves
@@ -67,26 +77,23 @@ class Comparison:
     tracked_sigma: Array  # (n, 3) mm, of all that counts
     off: Array  # (n, 2) mm, imaged less tracked
     covariance: Array  # (n, 2, 2) of these, of each frame alone
+    outliers: Mask  # (n,) that what follows is without
     mean: Array  # (2,) mm, weighted
     mean_covariance: Array  # (2, 2) of the mean beside zero, with what the calibrations leave open
+    chance: float  # of a mean as far from zero by what poses and calibrations leave open
     level: float  # scatter about the mean over the predicted
     faults: Mapping[str, Fault] = field(default_factory=dict)
 
     @property
     def distances(self) -> Array:
-        """In the plane : (n,) mm."""
-        return np.linalg.norm(self.off, axis=1)
+        """In the plane : (m,) mm, of those that are no outliers."""
+        return np.linalg.norm(self.off[~self.outliers], axis=1)
 
     @property
     def normalised(self) -> Array:
         """Distances from the mean over their standard deviation : (n,); sqrt(2) of a typical frame."""
         left = self.off - self.mean
         return np.sqrt(np.einsum("ni,ni->n", left, np.linalg.solve(self.covariance, left[..., None])[..., 0]))
-
-    @property
-    def chance(self) -> float:
-        """Of a mean as far from zero by what poses and calibrations leave open."""
-        return float(chdtrc(2, float(self.mean @ np.linalg.solve(self.mean_covariance, self.mean))))
 
     @property
     def named(self) -> list[str]:
@@ -129,7 +136,7 @@ def compare(seen: Seen, probe: ProbeCalibration, tip: Tip) -> Comparison:
     covariance = by_poses[:, :2, :2] + seen.pixel_covariance * np.outer(probe.scale, probe.scale)
     sigma = np.sqrt(np.diagonal(by_poses + propagate(effects, np.eye(effects.shape[-1])), axis1=1, axis2=2))
     depth = np.stack([np.zeros(len(off)), seen.pixels[:, 1] * probe.scale[1]], axis=-1)[..., None]
-    slopes = {TOOL: -by_tip[:, :2], PROBE: by_probe[:, :2, 2:], SOUND: depth, LATE: by_lag[:, :2]}
+    slopes = {TOOL: -by_tip[:, :2], PROBE: -by_probe[:, :2, 2:], SOUND: depth, LATE: by_lag[:, :2]}
     return _compared(tracked, sigma, off, covariance, effects[:, :2], slopes)
 
 
@@ -141,26 +148,52 @@ def _compared(
     effects : (n, 2, q) of what errs alike in all frames, of independent standard normal numbers.
     """
     whiten = whitening(covariance)
-    left, common = (whiten @ off[..., None])[..., 0], (whiten @ effects).reshape(2 * len(off), -1)
+    left, common = (whiten @ off[..., None])[..., 0], whiten @ effects
     rows = {"mean": whiten, **{name: whiten @ each for name, each in slopes.items() if np.abs(each).max() > 0}}
-    fitted = {name: _fitted(each, left, common) for name, each in rows.items()}
+    outliers = _outliers(rows, left)
+    used = ~outliers
+    fitted = {
+        name: _fitted(each[used], left[used], common[used]) for name, each in rows.items() if 2 * used.sum() > each.shape[2]
+    }
     mean = fitted.pop("mean")
-    rest = left - (whiten @ mean.values[:, None])[..., 0]
-    level = float(np.sqrt((rest**2).sum() / max(2 * len(off) - 2, 1)))
-    return Comparison(tracked, sigma, off, covariance, mean.values, mean.covariance, level, fitted)
+    rest = (left - whiten @ mean.values)[used]
+    level = float(np.sqrt((rest**2).sum() / max(rest.size - 2, 1)))
+    return Comparison(tracked, sigma, off, covariance, outliers, mean.values, mean.covariance, mean.chance, level, fitted)
+
+
+def _outliers(rows: Mapping[str, Array], left: Array) -> Mask:
+    """Frames : (n,) far off, by faults' whitened slopes : (n, 2, k) and residuals : (n, 2).
+
+    Each fault is fitted by the least sum of the residuals' lengths; that of the shortest ones, in the median, counts.
+    """
+    least, outliers = np.inf, np.zeros(len(left), bool)
+    if len(left) < LEAST_FRAMES:
+        return outliers
+    for slopes in rows.values():
+        freedom, lengths = 1 - slopes.shape[2] / left.size, np.ones(len(left))
+        for _ in range(ROUNDS):
+            weights = np.maximum(lengths, LEAST_LENGTH)[:, None] ** -0.5
+            weighted = (weights[..., None] * slopes).reshape(left.size, -1)
+            values = np.linalg.lstsq(weighted, (weights * left).ravel())[0]
+            lengths = np.linalg.norm(left - slopes @ values, axis=1)
+        scale = float(np.median(lengths)) / TYPICAL / np.sqrt(freedom)
+        if scale < least:
+            least, outliers = scale, lengths > FAR * max(scale, 1.0)
+    return outliers
 
 
 def _fitted(slopes: Array, left: Array, common: Array) -> Fault:
-    """A fault by whitened slopes : (n, 2, k) and residuals : (n, 2), beside common effects : (2 n, q)."""
+    """A fault by whitened slopes : (n, 2, k) and residuals : (n, 2), beside common effects : (n, 2, q)."""
     rows, k = slopes.reshape(left.size, -1), slopes.shape[-1]
     spread = inverse(rows.T @ rows)
     values = spread @ rows.T @ left.ravel()
     rest = left - (slopes @ values[:, None])[..., 0]
     alike = persistence(rest)
-    level = max(float((rest**2).sum()) / max(left.size - k, 1), 1.0) * alike
-    moved = spread @ rows.T @ common
-    covariance = level * spread + moved @ moved.T
+    level = float((rest**2).sum()) / (left.size - k)
+    moved = spread @ rows.T @ common.reshape(left.size, -1)
+    covariance = max(level, 1.0) * alike * spread + moved @ moved.T
     squared = float(values @ inverse(covariance) @ values)
+    chance = fdtrc(k, (left.size - k) / alike, squared / k) if level > 1 else chdtrc(k, squared)
     count = left.size / alike
     criterion = count * np.log(max(float((rest**2).sum()) / left.size, 1e-12)) + k * np.log(count)
-    return Fault(values, covariance, float(chdtrc(k, squared)), float(criterion))
+    return Fault(values, covariance, float(chance), float(criterion))

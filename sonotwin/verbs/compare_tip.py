@@ -6,7 +6,8 @@ water bath or a phantom, to many places, probe and needle turned about. Prints t
 systematic part with sigma, as a shift in the image and of the tool's tip, and whether it is within what poses and calibrations
 are known to; if not, the likely cause: a tip that lies elsewhere in the tool's frame, a probe that moved, another speed of sound,
 or a lag. How far the tip lies out of the plane isn't seen in a B-scan. Writes into the folder `out`: frames.csv, a row a B-scan;
-and metrics.json. What is there already is replaced. Exit status 1 if the tip isn't where tracking has it. Takes seconds.
+and metrics.json. What is there already is replaced. Exit status 1 if the tip isn't where tracking has it, or scatters too much to
+tell. Takes seconds.
 
     sonotwin compare-tip capture=outputs/track tip=outputs/tip/tip.yaml tissue_m_s=1488 out=outputs/compared
     sonotwin compare-tip sequence=needle.igs.mha reference=Needle tip=tip.yaml probe=probe.yaml out=outputs/compared

@@ -99,6 +99,21 @@ def test_a_needle_as_it_is_calibrated_is_where_tracking_has_it(source, recording
     assert len(rows) == COUNT and np.median(off) == pytest.approx(figures["off_median_mm"], abs=1e-3)
 
 
+def test_a_scatter_that_hides_what_is_off_gives_no_verdict(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(recording)
+    rng, find = np.random.default_rng(5), needle_echo.find
+
+    def elsewhere(*args):
+        found = find(*args)
+        return replace(found, pixel=found.pixel + 20 * rng.standard_normal(2))
+
+    monkeypatch.setattr(needle_echo, "find", elsewhere)
+    assert main(["compare-tip", "capture=capture", "tip=tip.yaml", *WATER, f"out={tmp_path / 'out'}"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("warning     no verdict: a scatter of over 3 times") for line in lines)
+    assert not any("within what" in line for line in lines)
+
+
 @pytest.fixture
 def compare(recording):
     """The comparison by some of the recording's B-scans, and a tip."""

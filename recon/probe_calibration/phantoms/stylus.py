@@ -171,7 +171,8 @@ def describe(found: StylusAdjustment, settings: Settings) -> Iterator[str]:
     """The held-out error, the tip, and what moved."""
     assert found.wire_covariance is not None
     sigma = float(np.sqrt(np.trace(found.wire_covariance)))
-    yield f"held out    {found.held_out_mm:.3f} mm (RMS of the tip, odd frames by even ones and back)"
+    if np.isfinite(found.held_out_mm):
+        yield f"held out    {found.held_out_mm:.3f} mm (RMS of the tip, odd frames by even ones and back)"
     if settings.tip is None:
         place = " ".join(f"{value:.2f}" for value in found.wire)
         yield f"tip         [{place}] ± {sigma:.2f} mm in the stylus' frame, found with the probe; tip= takes it as known"

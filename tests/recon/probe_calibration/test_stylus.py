@@ -7,6 +7,7 @@ import pytest
 
 from recon.capture import tip_files
 from recon.errors import InputError
+from recon.freehand.sequence_sweep import SequenceSweep
 from recon.model import tracks
 from recon.model.tip import Tip
 from recon.model.tracks import Track
@@ -15,6 +16,7 @@ from recon.probe_calibration.needle_echo import NeedleEcho
 from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.phantoms import stylus
 from recon.probe_calibration.tank_calibration import Settings
+from recon.session import probe_step
 from tests.recon import needle_scans
 from tests.recon.probe_motions import true_probe
 from tests.recon.stylus_motions import PIXEL_PX, known_tip, lead, tracked
@@ -91,6 +93,24 @@ def test_noise_of_the_stylus_counts_where_no_pose_has_a_covariance(calibrate, le
     np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
+def test_noise_of_the_stylus_counts_at_another_lag_too(led, rig, rng):
+    """Of poses at the B-scans' own moments the covariance is the one that is taken without a lag to find."""
+    relative, pixels = led(rng)
+    numbers, size = np.arange(len(pixels)), rig.probe.image_size
+    sweep = SequenceSweep("stylus", size, numbers, 0.1 * numbers, relative.poses, lambda: iter(()))
+    seen = tuple(NeedleEcho(pixel, np.diag(PIXEL_PX**2), 30.0) for pixel in pixels)
+    frames = PhantomFrames("stylus", size, None, numbers, seen, 0, "stylus")
+    found = probe_step.at_lag(frames, sweep, 0.0, 0.0, 0.0, KNOWN.noise).sightings.pose_covariance
+    np.testing.assert_allclose(found, KNOWN.noise.from_body(relative.poses), atol=1e-12)
+
+
+def test_few_frames_have_no_held_out_error_to_describe(calibrate, led, rng):
+    """Halves of nine frames are too few for a calibration."""
+    relative, pixels = led(rng, count=9)
+    found = calibrate(relative, pixels, known_tip(rng))
+    assert not any("nan" in line for line in stylus.describe(found, KNOWN))
+
+
 def test_a_tip_that_is_elsewhere_is_named(calibrate, led, rng):
     relative, pixels = led(rng)
     tip = known_tip(rng)
@@ -109,6 +129,18 @@ def test_another_bodys_tip_is_refused_by_its_name(tmp_path, rng):
     with pytest.raises(InputError, match="body: expected the stylus' name"):
         stylus.read(Settings(phantom="stylus"), None)
     assert stylus.read(Settings(phantom="stylus"), "Stylus") is None
+
+
+@pytest.mark.parametrize(("name", "value", "owner"), [
+    ("tip_radius_mm", 0.5, "stylus"),
+    ("tip_radius_sigma_mm", 0.1, "stylus"),
+    ("sphere_radius_mm", 19.8, "sphere"),
+    ("sphere_radius_sigma_mm", 0.1, "sphere"),
+])  # fmt: skip
+def test_fields_of_another_phantom_are_refused(name, value, owner):
+    with pytest.raises(ValueError, match=f"{name}: expected none with phantom=crossed_wires, found {value}: phantom={owner}"):
+        Settings(**{name: value})
+    assert getattr(Settings(phantom=owner, **{name: value}), name) == value
 
 
 def _metres(poses):
