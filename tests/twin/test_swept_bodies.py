@@ -62,7 +62,7 @@ def test_a_capture_has_their_poses_and_the_truth_has_both_clocks(tmp_path):
         assert truth["world_from_target"].shape == (len(found.track.times), 4, 4)
         off = found.bodies["needle"].poses[:, :3, 3] - truth["world_from_target"][:, :3, 3]
         assert 0.01 < off.std() < 0.05
-        assert scans["world_from_target"].shape == (len(found.times), 4, 4)
+        assert scans["reference_from_target"].shape == (len(found.times), 4, 4)
         assert scans["tip_px"].shape == (len(found.times), 2) and scans["axis_mm"].shape == (len(found.times), 2, 3)
         np.testing.assert_allclose(found.times - scans["times_ns"], 50_000_000, atol=20_000_000)
 
