@@ -82,6 +82,15 @@ class SweepSettings(LedBodies):
         return self
 
     @model_validator(mode="after")
+    def _moved_before_cameras(self) -> "SweepSettings":
+        if self.moved != Moved() and not self.filmed:
+            raise ValueError(
+                "moved: expected filmed=true with it, found filmed=false: `sonotwin track` takes it out of the poses "
+                "that it finds in frames, and nothing takes it out of given ones"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _of_the_rig(self) -> "SweepSettings":
         check_names(self.bodies, self.rig)
         return self

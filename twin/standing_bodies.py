@@ -16,8 +16,12 @@ from twin.tracking.study_samples import CLEAN
 Array = NDArray[np.float64]
 
 
-def with_standing(scene: Scene, rig: Rig, led: LedBodies, seed: int) -> tuple[Scene, dict[str, Array]]:
+def with_standing(scene: Scene, rig: Rig, designed: Rig, led: LedBodies, seed: int) -> tuple[Scene, dict[str, Array]]:
     """The scene with all bodies that stand beside it, as they look in a sweep of the same seed, and their poses by name.
+
+    Parameters
+    ----------
+    rig, designed : as cameras and prints are, and as they were designed, by which bodies are led as in a sweep
 
     Returns
     -------
@@ -32,9 +36,9 @@ def with_standing(scene: Scene, rig: Rig, led: LedBodies, seed: int) -> tuple[Sc
     centres = np.array([device.optics.camera().centre for device in (rig.cam1, rig.cam2)])
     meshes = [thing.mesh for thing in scene.things if not thing.inside]
     about = meshes[0].bounds.mean(axis=0)  # of what is scanned
-    for name, path in led.standing(rig).items():
+    for name, path in led.standing(designed).items():
         target, number = rig.bodies[name], list(rig.bodies).index(name) + 1
-        pose = led.lead(name, path, rig, np.eye(4), seed, STILL).pose(0.0)
+        pose = led.lead(name, path, designed, np.eye(4), seed, STILL).pose(0.0)
         eyes = rigid.apply(rigid.invert(pose), centres)
         stand = stand_at(pose, target, meshes, eyes, about, np.eye(4))
         parts = led.look(name).parts(np.random.default_rng([seed, 4, number]), target, stand)

@@ -34,7 +34,7 @@ class SweptBody:
     way: Way  # at any time of the path, s
     track: Track  # world_from_target by the cameras: (m,), stamped as the probe's poses
     truth: Track  # the same at the cameras' moments
-    scanned: Track  # at the moments when the n images are taken
+    scanned: Track  # reference_from_target at the moments when the n images are taken; the patient may have moved since
 
     @property
     def shaft(self) -> Shaft | None:

@@ -31,6 +31,7 @@ from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene, parse_scene
+from scenes.scene_types import Scene
 from sonotwin.console_watch import LineConsole
 from twin import board_session
 from twin.conditions import IDEAL, Conditions, check_board, drifted, printed
@@ -157,13 +158,18 @@ def render_poses(settings: board_session.Settings, placed: Array, session: Sessi
     console.print(f"render      {len(missing)} poses, {patterns} patterns, {samples} samples/px, {seconds:.1f} s")
 
 
-def render_surface(config: Config, session: Session, console: Console) -> None:
-    """Render each camera's images of the scene under the patterns."""
-    session.check()
+def set_up(config: Config) -> tuple[Rig, Scene, dict[str, Array]]:
+    """The rig as it is in use, the scene with what stands beside it, and the poses `world_from_target` of that by name."""
     rig, errors = drifted(config.rig, config.conditions.drift, config.seed), config.conditions.target
     prints = {name: printed(one, errors, config.seed, k) for k, (name, one) in enumerate(rig.bodies.items(), 1)}
     rig = rig.model_copy(update={"bodies": prints})
-    scene, standing = with_standing(build_scene(config.scene), rig, config, config.seed)
+    return rig, *with_standing(build_scene(config.scene), rig, config.rig, config, config.seed)
+
+
+def render_surface(config: Config, session: Session, console: Console) -> None:
+    """Render each camera's images of the scene under the patterns."""
+    session.check()
+    rig, scene, standing = set_up(config)
     views = {}
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()

@@ -15,8 +15,10 @@ from recon.model import circle_layout
 from scenes.catalogue import build_scene
 from scenes.handheld import lofts
 from scenes.scene_types import Material, Thing
-from sonotwin import read_rig
+from sonotwin import config, read_rig
 from sonotwin.cli import main
+from sonotwin.verbs import render, sweep
+from twin.filmed_sweep import plan_sweep
 from twin.standing_bodies import with_standing
 from twin.tracking.led_bodies import LedBodies
 
@@ -158,11 +160,22 @@ def test_a_board_stands_on_what_lies_below_it():
         plane = build_scene({"kind": "plane", "centre_mm": [4, -2, 720.0]})
         box = lofts.box([60, 60, step_mm + 1], [-82, 66, 720.5 - step_mm / 2])  # the lower 1 mm of it in the plane
         scene = replace(plane, things=(*plane.things, Thing("block", box, Material(0.5), smooth=False)))
-        whole, poses = with_standing(scene, rig, led, 3)
+        whole, poses = with_standing(scene, rig, rig, led, 3)
         parts = [thing.mesh for thing in whole.things if thing.name.startswith("patient")]
         assert list(poses) == ["patient"] and len(parts) == len(whole.things) - len(scene.things)
         assert max(mesh.bounds[1, 2] for mesh in parts) == pytest.approx(720 - step_mm, abs=0.01)
         assert all(mesh.is_watertight for mesh in parts)
     with pytest.raises(InputError, match=r"bodies\.third\.path: needs a value: 2 bodies stand beside what is scanned"):
-        others = dict.fromkeys(("first", "second", "third"), rig.target)
-        with_standing(plane, rig.model_copy(update={"bodies": others}), led, 3)
+        crowded = rig.model_copy(update={"bodies": dict.fromkeys(("first", "second", "third"), rig.target)})
+        with_standing(plane, crowded, crowded, led, 3)
+
+
+def test_a_board_keeps_its_place_from_the_fringes_to_the_sweep():
+    """However its print, the cameras and the hand err."""
+    fields, body = ["rig=three_bodies", "scene=test_object", "conditions=lifelike", "seed=5", "out=unused"], "patient"
+    made = config.load("render", fields, render.Config)
+    used, _, under_fringes = render.set_up(made)
+    assert used.bodies[body] != made.rig.bodies[body] and used.cam1 != made.rig.cam1
+    small = ["rig.probe.image_size=[48,128]", "ultrasound.image_size=[48,128]", "path=hold", "path.seconds=1", "filmed=true"]
+    swept = plan_sweep(config.load("sweep", [*fields, *small], sweep.Config)).bodies[body].truth.poses
+    np.testing.assert_allclose(swept, np.broadcast_to(under_fringes[body], swept.shape), atol=1e-9)

@@ -149,6 +149,7 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
         (["ultrasound.image_size=[96,96]"], "ultrasound.image_size: expected rig.probe's [321, 408], found [96, 96]"),
         (["clocks.scanner_hz=0"], "clocks.scanner_hz: expected greater than 0, found 0"),
         (["pose_noise.turn_deg=-1"], "pose_noise.turn_deg: expected greater than or equal to 0, found -1"),
+        (["moved.shift_mm=[0,9,0]"], "moved: expected filmed=true with it"),
         (["seed=-1"], "seed: expected greater than or equal to 0, found -1"),
         (
             ["bodies.needle={look: {kind: needle}}"],

@@ -62,7 +62,7 @@ def test_a_capture_has_their_poses_and_the_truth_has_both_clocks(tmp_path):
         assert truth["world_from_target"].shape == (len(found.track.times), 4, 4)
         off = found.bodies["needle"].poses[:, :3, 3] - truth["world_from_target"][:, :3, 3]
         assert 0.01 < off.std() < 0.05
-        assert scans["world_from_target"].shape == (len(found.times), 4, 4)
+        assert scans["reference_from_target"].shape == (len(found.times), 4, 4)
         assert scans["tip_px"].shape == (len(found.times), 2) and scans["axis_mm"].shape == (len(found.times), 2, 3)
         np.testing.assert_allclose(found.times - scans["times_ns"], 50_000_000, atol=20_000_000)
 
@@ -82,7 +82,7 @@ def test_the_needle_is_seen_in_the_b_scans_at_its_tip(tmp_path):
 
 def test_a_patient_who_moved_carries_scene_probe_and_bodies(tmp_path):
     """The scanner sees the same, the cameras see all moved by one step about the phantom's middle."""
-    still, moved = planned(), planned("moved={turn_deg: [0, 3, 4], shift_mm: [12, -16, 0]}")
+    still, moved = planned(), planned("filmed=true", "moved={turn_deg: [0, 3, 4], shift_mm: [12, -16, 0]}")
     step, middle = moved.world_from_reference, still.scene.things[0].mesh.bounds.mean(axis=0)
     np.testing.assert_array_equal(still.world_from_reference, np.eye(4))
     np.testing.assert_allclose(rigid.apply(step, middle) - middle, [12, -16, 0], atol=1e-9)

@@ -188,7 +188,7 @@ class TrackedBody(Protocol):
 
     @property
     def scanned(self) -> Track:
-        """The same at the moments when the n images are taken."""
+        """Poses `reference_from_target` when the n images are taken, in the world as it was under the fringes."""
         ...
 
     @property
@@ -242,17 +242,15 @@ def write_session(
         track, tracks = (planned.track, {further: led.track for further, led in bodies.items()}) if film is None else (None, {})
         capture.add_sweep(times, images(), devices, track, name, session.purpose, tracks)
         for further, led in bodies.items():
-            truth.write_arrays(str(own / BODIES / f"{further}.npz"), _poses(led.truth))
+            seen = {"times_ns": led.truth.times, "world_from_target": led.truth.poses}
+            scanned = {"times_ns": led.scanned.times, "reference_from_target": led.scanned.poses}
+            truth.write_arrays(str(own / BODIES / f"{further}.npz"), seen)
             placed = {key: np.array([each[key] for each in shown[further]]) for key in (shown[further] or [{}])[0]}
-            truth.write_arrays(str(own / SCANS / f"{further}.npz"), _poses(led.scanned) | placed)
+            truth.write_arrays(str(own / SCANS / f"{further}.npz"), scanned | placed)
         if film is not None:
             film.finish(capture, truth)
         if probe is not None:
             capture.add_probe(probe)
-
-
-def _poses(track: Track) -> dict[str, NDArray]:
-    return {"times_ns": track.times, "world_from_target": track.poses}
 
 
 def _describe_sound(scene: Scene, body: Body) -> dict[str, object]:

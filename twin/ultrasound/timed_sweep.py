@@ -28,7 +28,8 @@ class Clocks(Part):
     """Rates of scanner and cameras, and errors of their time stamps. Truth is the cameras' clock."""
 
     scanner_hz: Positive = 20.0
-    """images/s; usual at 5 cm with compounding; of wires one image a pose instead"""
+    """images/s; usual at 5 cm with compounding; of wires, rows and tilts one image a rest instead, unless the path's `rest_s`
+    is 0"""
     camera_hz: Positive = 40.0
     """pairs of frames/s, or poses/s; assumed, a fifth of what the cameras could"""
     lag_s: LagSeconds = 0.05

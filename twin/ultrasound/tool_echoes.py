@@ -4,6 +4,9 @@ The shaft is a line of strips of a mirror, as wide as `tool_resonance` has it, a
 are laid with their phases, so that a shaft is bright where it is square to the beam, and else is seen by its ends and roughness
 alone. Echoes that are laid at places between lines pass a filter that lets through all that apertures accept, and nothing that
 the lines' raster would fold back: a steep shaft leaves only what its ends diffract.
+
+The tissue at the tip stands for all that lies about the shaft, in its bounce and in its ringing: of one that passes from fat into
+a mass, both are those of the mass all along.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,9 @@
 """Echo of an endless round shaft, front and all that rings within it: a series of partial waves for concentric fluids.
 
-With the radial wavenumbers of the media at a tilt, waves are `J_n + A_n H_n` outside, `J_n + q_n Y_n` in the wall, and `J_n` in
-the bore; pressure and the radial velocity `(1 / rho) dp/dr` are continuous at each border. What comes back is that of a strip of
-a perfect mirror of the width
+With the radial wavenumbers of the media at a tilt, waves are `J_n + A_n H_n` outside, `J_n + q_n H_n` in the wall, and `J_n` in
+the bore; pressure and the radial velocity `(1 / rho) dp/dr` are continuous at each border. At high orders J_n is too small and
+H_n too large for numbers, so that logarithmic derivatives and ratios stand for both. What comes back is that of a strip of a
+perfect mirror of the width
 
     W = lambda / pi sum_n eps_n (-1)^n A_n,
 
@@ -16,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import jv, yv
+from scipy.special import hankel1, jv
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -64,36 +65,46 @@ def strip_width(k: Complex, tilt: Array | float, layers: Layers) -> Complex:
     slowed = k * layers.assumed_speed
     along = np.sin(tilt) * slowed / layers.around[1]
     radial = [np.sqrt((slowed / speed + 1j * loss) ** 2 - along**2) for _, speed, loss in _media(layers)]
+    radial = [np.where(root.imag < 0, -root, root) for root in radial]  # H decays outwards, where the wall's waves do, too
     density = [impedance / speed for impedance, speed, _ in _media(layers)]
     orders = np.arange(int(np.abs(radial[0]).max() * layers.radius) + 12)
     push = [each[..., None] / rho for each, rho in zip(radial, density, strict=True)]
     outside, wall = (_Waves.at(orders, radial[k][..., None] * layers.radius) for k in (0, 1))
-    q = np.zeros_like(wall.y)
+    stiff = push[1] * wall.standing
     if layers.bore:
         inner, bore = (_Waves.at(orders, radial[k][..., None] * layers.bore) for k in (1, 2))
-        stiff = push[2] * bore.slope_j / bore.j
-        q = -(push[1] * inner.slope_j - stiff * inner.j) / (push[1] * inner.slope_y - stiff * inner.y)
-    stiff = push[1] * (wall.slope_j + q * wall.slope_y) / (wall.j + q * wall.y)
-    standing, other = push[0] * outside.slope_j - stiff * outside.j, push[0] * outside.slope_y - stiff * outside.y
-    scattered = -standing / (standing + 1j * other)
+        filled, across = push[2] * bore.standing, np.cumprod(inner.steps / wall.steps, axis=-1)
+        q = -across * (push[1] * inner.standing - filled) / (push[1] * inner.outgoing - filled)  # times H / J at the front
+        stiff = push[1] * (wall.standing + q * wall.outgoing) / (1 + q)
+    scattered = -np.cumprod(outside.steps, axis=-1) * (push[0] * outside.standing - stiff) / (push[0] * outside.outgoing - stiff)
     total = (np.where(orders == 0, 1, 2) * (-1.0) ** orders * scattered).sum(axis=-1)
     return 2 * layers.around[1] / slowed * total * np.exp(2j * radial[0] * layers.radius)
 
 
 class _Waves(NamedTuple):
-    """Bessel functions at a border, and their derivatives."""
+    """Bessel functions J and Hankel functions H of the orders n at a border."""
 
-    j: Complex
-    y: Complex
-    slope_j: Complex
-    slope_y: Complex
+    standing: Complex  # (..., n) J' / J
+    outgoing: Complex  # (..., n) H' / H
+    steps: Complex  # (..., n) J / H over that of the order before; of order 0 J / H
 
     @classmethod
     def at(cls, orders: NDArray[np.int64], x: Complex) -> "_Waves":
-        """Of all orders from 0 on at x : (..., 1)."""
-        j, y = jv(orders, x), yv(orders, x)
-        before = (np.concatenate([-each[..., 1:2], each[..., :-1]], axis=-1) for each in (j, y))
-        return cls(j, y, *(less - orders / x * each for less, each in zip(before, (j, y), strict=True)))
+        """Of all orders from 0 on at x : (..., 1), by recurrences each in the direction in which it is stable."""
+        twice = 2 / x[..., 0]
+        reach = float(np.abs(x).max())
+        rising = [np.zeros_like(twice)]  # J_n / J_(n-1), from far beyond the orders that the waves reach
+        for n in range(max(len(orders), int(reach + 10 * np.cbrt(reach)) + 20), 0, -1):
+            rising.append(1 / (n * twice - rising[-1]))
+        more = np.stack(rising[::-1], axis=-1)[..., : len(orders)]  # of the order after each
+        first, second = hankel1(0, x[..., 0]), hankel1(1, x[..., 0])
+        falling = [first / second]  # H_(n-1) / H_n
+        for n in orders[1:-1]:
+            falling.append(1 / (n * twice - falling[-1]))
+        less = np.stack(falling, axis=-1)
+        steps = np.concatenate([(jv(0, x[..., 0]) / first)[..., None], more[..., :-1] * less], axis=-1)
+        outgoing = np.concatenate([-(second / first)[..., None], less - orders[1:] / x], axis=-1)
+        return cls(orders / x - more, outgoing, steps)
 
 
 def _media(layers: Layers) -> tuple[tuple[float, float, float], ...]:

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from recon.geometry import rigid
 from recon.model.rig import Finite, NotNegative, Positive, Target
@@ -50,6 +50,15 @@ class Kind(HeldTool):
         if value not in DIAMETERS_MM:
             raise ValueError(f"expected one of {', '.join(map(str, DIAMETERS_MM))}, found {value}")
         return value
+
+    @model_validator(mode="after")
+    def _bevel_on_shaft(self) -> "Kind":
+        bevel = DIAMETERS_MM[self.gauge] / np.tan(np.deg2rad(self.bevel_deg))
+        if bevel > self.length_mm:
+            raise ValueError(
+                f"bevel_deg: expected a bevel of at most length_mm = {self.length_mm:g}, found one of {bevel:.1f} mm"
+            )
+        return self
 
     def shaft(self, target: Target) -> Shaft:
         """The tube, with its bevel's point at the tip."""

@@ -37,6 +37,15 @@ class Kind(HeldTool):
             raise ValueError(f"ball_mm: expected 0, or diameter_mm = {self.diameter_mm:g} to 20, found {self.ball_mm:g}")
         return self
 
+    @model_validator(mode="after")
+    def _point_on_rod(self) -> "Kind":
+        point = self.diameter_mm / 2 / np.tan(np.deg2rad(self.point_deg))
+        if not self.ball_mm and point > self.length_mm:
+            raise ValueError(
+                f"point_deg: expected a point of at most length_mm = {self.length_mm:g}, found one of {point:.1f} mm"
+            )
+        return self
+
     def shaft(self, target: Target) -> Shaft:
         """The rod, its foremost point at the tip."""
         _, along = self.axis(target)

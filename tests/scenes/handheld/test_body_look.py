@@ -93,6 +93,10 @@ def test_a_body_looks_like_its_name():
 def test_nonsense_is_refused_by_name():
     with pytest.raises(ValidationError, match=r"ball_mm: expected 0, or diameter_mm = 2 to 20, found 1"):
         Look.model_validate({"kind": "stylus", "ball_mm": 1})
+    with pytest.raises(ValidationError, match=r"point_deg: expected a point of at most length_mm = 10, found one of 45.7 mm"):
+        Look.model_validate({"kind": "stylus", "ball_mm": 0, "diameter_mm": 8, "point_deg": 5, "length_mm": 10})
+    with pytest.raises(ValidationError, match=r"bevel_deg: expected a bevel of at most length_mm = 10, found one of 15.0 mm"):
+        Look.model_validate({"kind": "needle", "gauge": 14, "bevel_deg": 8, "length_mm": 10})
     for field, value, words in (("gauge", 24, "expected one of"), ("direction", (0, 0, 1), "behind the board's face")):
         with pytest.raises(ValidationError, match=words) as caught:
             Look.model_validate({"kind": "needle", field: value})

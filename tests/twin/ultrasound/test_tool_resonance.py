@@ -8,6 +8,7 @@ from twin.ultrasound.tool_resonance import BEFORE, TILT_STEP, Layers, resonance,
 K = 2 * np.pi / (1.54 / 7.5)
 WATER, STEEL = (1.486, 1488.3, 0.0), (46.0, 5900.0, 0.0)
 HARD = (1e6, 1e6, 0.0)
+AIR = (0.0004, 343.0, 0.0)
 LAMBDA = 1.4883 / 7.5  # mm
 R = (46.0 - 1.486) / (46.0 + 1.486)
 
@@ -66,8 +67,20 @@ def test_beyond_the_critical_angle_nothing_rings():
 
 def test_water_in_the_bore_shows_its_far_wall_and_air_does_not():
     """As deep as the near wall and the bore are in sound's time, 0.92 mm; nothing passes from steel into air."""
-    water, air = (pulsed(rod(bore=0.419, filling=one)) for one in (WATER, (0.0004, 343.0, 0.0)))
+    water, air = (pulsed(rod(bore=0.419, filling=one)) for one in (WATER, AIR))
     beyond = slice(BEFORE + 11, BEFORE + 20)
     assert 20 * np.log10(water[beyond].max() / air[beyond].max()) > 10
     depth = 0.06125 * (11 + water[beyond].argmax())
     assert depth == pytest.approx(0.216 * 1540 / 5900 + 0.838 * 1540 / 1488.3, abs=0.08)
+
+
+@pytest.mark.parametrize("frequency_mhz", [5.0, 7.5, 15.0])
+@pytest.mark.parametrize(("radius", "bore"), [(4.0, 0.0), (1.055, 0.8)])
+def test_the_thickest_shafts_have_an_echo(frequency_mhz, radius, bore):
+    """A rod of 8 mm, and a wide tube of air: at high orders J and H leave the range of numbers."""
+    layers = Layers(radius, bore, WATER, STEEL, AIR, 2 * np.pi * frequency_mhz / 1.54, 1540.0, 0.06125 * 5 / frequency_mhz)
+    echo = np.abs(resonance(layers))
+    assert np.isfinite(echo).all() and echo[0].argmax() in range(BEFORE, BEFORE + 9), "at its front, or as its wall rings"
+    steep = strip_width(np.array([layers.wavenumber + 0.1j]), np.radians(60), layers)[0]
+    expected = np.sqrt(radius * 1.4883 / frequency_mhz / 4) * np.exp(0.25j * np.pi)
+    assert np.abs(steep) == pytest.approx(np.abs(expected), rel=0.1), "beyond the critical angle all comes back"
