@@ -1,4 +1,4 @@
-"""The demonstration, whole: from a command to a report, by cameras of half the size; and its steps, settings and words."""
+"""The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
 
 import html
 import json
@@ -25,7 +25,6 @@ from sonotwin.demonstration import Config
 from sonotwin.pipeline import Step
 from sonotwin.verbs import evaluate, film, reconstruct, render, sweep, track
 from sonotwin.verbs.demo import followed, looked_inside
-from tests.twin.small_rigs import half_as_fields
 from twin.evaluation import session_errors, sweep_errors, track_errors
 
 SMALL = (  # cameras at half their size: fringes of ten pixels a period
@@ -99,16 +98,9 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
 
 
 @pytest.mark.slow
-def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys, rig):
-    """Without errors of the laboratory: outside, inside, and the report of both; steps that are lost come back the same.
-
-    By cameras of half the size, whose pixels gather as much light.
-    """
-    half = [
-        *half_as_fields(rig),
-        *(f"rig.{name}.lens.f_number={2 * getattr(rig, name).lens.f_number}" for name in ("cam1", "cam2")),
-    ]
-    fields = [*half, "conditions=ideal", f"out={tmp_path / 'demo'}", f"board={tmp_path / 'board'}"]
+def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
+    """Without errors of the laboratory: outside, inside, and the report of both; steps that are lost come back the same."""
+    fields = ["conditions=ideal", f"out={tmp_path / 'demo'}", f"board={tmp_path / 'board'}"]
     assert main(["demo", *fields]) == 0
     demonstrated = load("demo", fields, Config)
     check_figures(demonstrated.out, capsys.readouterr().out.splitlines())
@@ -123,11 +115,11 @@ def check_figures(out: Path, printed: list[str]) -> None:
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
     noise = np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
     assert metrics["surface_interior_rms_mm"] < 1.1 * noise and metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
-    assert 0.02 < metrics["point_sigma_mm"] < 0.08  # by geometry: as of drawn points with a sighting's noise in such pixels
+    assert 0.01 < metrics["point_sigma_mm"] < 0.04  # by geometry: as of drawn points with a sighting's noise
     assert metrics["shape_error_rms_mm"] < 0.1 * metrics["limit_rms_mm"]
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
-    assert 0.9 < metrics["z_std"] < 3.5  # sigma is of noise alone, less than half of the calibration's, which shows beside it
+    assert 0.9 < metrics["z_std"] < 2  # sigma is of noise alone, a third of one camera's: beside it the calibration's form shows
     assert (metrics["tumours_true"], metrics["tumours_found"], metrics["tumours_false"]) == (3, 3, 0)
     assert metrics["lag_low_ms"] - 2 < 50 < metrics["lag_high_ms"] + 2
     assert metrics["placement_rms_mm"] < 1

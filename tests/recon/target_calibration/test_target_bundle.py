@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from recon.geometry import camera_jacobian, rigid
 from recon.model import circle_layout
@@ -12,7 +13,8 @@ from recon.model.calibration import Uncertainty
 from recon.target_calibration import target_bundle
 from tests.recon.target_calibration import target_pairs
 
-DRAWS = 8
+DRAWS, PAIRS = 20, 4
+BUT_DIAMETER = [0, 1, 2, 4, 5, 6]  # of which the covariance has a bound
 
 
 @pytest.fixture(scope="module")
@@ -25,34 +27,39 @@ def numbers(target):
     return np.array([*circle_layout.lengths(target), target.outer_diameter_mm, *target.curvature_per_m])
 
 
+def squared_error(found, actual):
+    """Of lengths and curvature, over their covariance."""
+    off = (numbers(found.target) - numbers(actual))[BUT_DIAMETER]
+    return off @ np.linalg.solve(found.covariance[np.ix_(BUT_DIAMETER, BUT_DIAMETER)], off)
+
+
 def test_errors_are_as_large_as_predicted(cameras, rig, rng):
-    """Squared errors over the covariance of the lengths and the curvature are chi-square; the diameter's is a bound."""
-    squared, curved = [], []
+    """Squared errors over their covariance are chi-square: half or double of it would be seen; the diameter's is a bound."""
+    squared = []
     for _ in range(DRAWS):
         actual = target_pairs.printed(rig.target, rng)
-        found = target_bundle.adjust(target_pairs.many(cameras, actual, 6, rng), rig.target, None)
+        found = target_bundle.adjust(target_pairs.many(cameras, actual, PAIRS, rng), rig.target, None)
         off = numbers(found.target) - numbers(actual)
-        squared.append(off[:3] @ np.linalg.solve(found.covariance[:3, :3], off[:3]))
-        curved.append(off[4:] @ np.linalg.solve(found.covariance[4:, 4:], off[4:]))
+        squared.append(squared_error(found, actual))
         assert np.abs(off[:3]).max() < 0.01 and abs(off[3]) < 4 * np.sqrt(found.covariance[3, 3])
-    for values in (squared, curved):
-        assert abs(np.mean(values) - 3) < 4 * np.sqrt(6 / DRAWS)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], DRAWS * len(BUT_DIAMETER))
+    assert low < sum(squared) < high
 
 
 def test_errors_of_the_cameras_are_in_the_covariance(cameras, rig, rng):
     """Baseline and angle of camera 2 drawn from their covariance: the target's scale is off by theirs, and that is predicted."""
     names, sigma = ("ry", "tx", "fx"), np.array([5e-5, 0.1, 0.3])
     optics, squared, blind = Uncertainty(tuple(f"cam2.{name}" for name in names), np.diag(sigma**2)), [], []
-    for _ in range(DRAWS // 2):
+    for k in range(DRAWS):
         real = camera_jacobian.moved(cameras[1], names, sigma * rng.standard_normal(3))
         actual = target_pairs.printed(rig.target, rng)
-        pairs = target_pairs.many(cameras, actual, 6, rng, (cameras[0], real))
-        for known, results in ((optics, squared), (None, blind)):
-            found = target_bundle.adjust(pairs, rig.target, known)
-            off = numbers(found.target)[:3] - numbers(actual)[:3]
-            results.append(off @ np.linalg.solve(found.covariance[:3, :3], off))
-    assert abs(np.mean(squared) - 3) < 4 * np.sqrt(6 / len(squared))
-    assert np.mean(blind) > 3 + 4 * np.sqrt(6 / len(blind))
+        pairs = target_pairs.many(cameras, actual, PAIRS, rng, (cameras[0], real))
+        squared.append(squared_error(target_bundle.adjust(pairs, rig.target, optics), actual))
+        if k < 4:
+            blind.append(squared_error(target_bundle.adjust(pairs, rig.target, None), actual))
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], DRAWS * len(BUT_DIAMETER))
+    assert low < sum(squared) < high
+    assert sum(blind) > chi2.ppf(1 - 1e-4, len(blind) * len(BUT_DIAMETER))
 
 
 def test_a_wrong_pair_is_left_out(cameras, rig, rng):
