@@ -38,7 +38,8 @@ SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "rig.cam2.sensor.pixel_um=9.6",
     "tracing.samples=4",
     "scene.edge_mm=1.5",
-    "poses.count=4",
+    "poses.count=3",
+    "board_samples=2",
     "film_frames=0",  # a camera of half the size shows the tracker half a target
 )
 COARSE = [  # B-scans of half the lines and two thirds of the rows
@@ -63,21 +64,20 @@ def figures(folder):
     return json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
 
 
-@pytest.mark.slow
 def test_a_small_demonstration_runs_through(tmp_path, capsys):
     out = tmp_path / "demo"
     assert main(["demo", *SMALL, "path=none", f"out={out}", f"board={tmp_path / 'board'}"]) == 0
     assert not [name for name in MADE if not (out / name).is_file()]
     metrics = figures(out)
     # With four samples a pixel rendering noise adds to the sensor's; at this size edges are a larger part of the image.
-    # Four poses of a board that is printed and bowed as in life leave the scale open, as the calibration says.
+    # Three poses of a board that is printed and bowed as in life leave the scale open, as the calibration says.
     assert metrics["surface_interior_rms_mm"] < 3 * np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
     assert metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
-    # Behind the breast's steep side, where light that spreads leaves little of the fringes, the table isn't reached at this size.
-    assert metrics["coverage"] > 0.7 and metrics["gross_error_fraction"] < 0.01
+    assert metrics["shape_error_rms_mm"] < 2.5 * metrics["shape_sigma_mm"] < 0.25
+    assert metrics["coverage"] > 0.95 and metrics["gross_error_fraction"] < 0.01
     steps = ("board", "render", "reconstruct", "evaluate", "report", "demo")
     assert all(f"seconds_{name}" in metrics for name in steps)
-    assert max(metrics[f"reprojection_rms_{name}_px"] for name in ("cam1", "cam2", "projector")) < 0.05
+    assert max(metrics[f"reprojection_rms_{name}_px"] for name in ("cam1", "cam2", "projector")) < 0.02
     printed = capsys.readouterr().out.splitlines()
     wrote = [re.fullmatch(r"wrote +(.*)/\{(.*)\}", line) for line in printed if line.startswith("wrote")]
     assert len(wrote) == 7  # two renders, four steps of the reconstruction, and the evaluation
