@@ -139,7 +139,7 @@ def test_a_target_of_known_lengths_tells_the_scale(rig, calibration):
         places = meet([found.cameras[name] for name in ("cam1", "cam2")], seen)[0]
         modes = uncertainty.similarity_modes(volume)
         normal.append(np.linalg.lstsq(modes.reshape(-1, 7), (places - volume).ravel(), rcond=None)[0][-1] / sigma)
-    assert abs(np.mean(np.square(normal)) - 1) < 4 * np.sqrt(2 / 10)
+    assert chi2.ppf(1e-3, 10) < np.sum(np.square(normal)) < chi2.ppf(1 - 1e-3, 10)
     by_cameras = drift.estimate(calibration, film, None, drift_step.with_open_scale(target), 3e-4, DRIFT_PX).after
     assert uncertainty.scale(by_cameras, "cam1", "cam2", volume) > 2.9e-4
 
