@@ -51,6 +51,17 @@ def test_it_tilts_to_all_sides_and_turns(config):
     assert len({tuple(side) for side in np.sign(across[tilt > 20]).tolist()}) == 4
 
 
+def test_a_needle_pivots_about_its_own_tip():
+    """Where no other is given; it stays in the dimple, where the path's usual tip doesn't."""
+    body = "bodies.needle={path: {kind: pivot, middle_mm: [12, -28, 700]%s}}"
+    for given, rests in (("", True), (", tip_mm: [0, -120, -30]", False)):
+        config = load("film", ["out=unused", "rig=three_bodies", body % given], Config)
+        target = config.rig.bodies["needle"]
+        way = config.lead("needle", config.path_of("needle", 0), config.rig, np.eye(4), 0, Motion())
+        tips = np.array([rigid.apply(way.pose(time), config.look("needle").tip_mm(target)) for time in SECONDS[::10]])
+        assert (np.ptp(tips, axis=0).max() < 1e-9) == rests
+
+
 def test_both_cameras_see_the_circles_whole(config):
     rig, way = takes.rig(), config.path.lead(config.rig.target, EYES, 3)
     cameras = [getattr(rig, name).optics.camera() for name in ("cam1", "cam2")]
@@ -122,6 +133,12 @@ def test_what_cannot_be_led_to_an_aim_is_refused(config):
         insertion.Kind().lead(config.rig.target, EYES, 0)
     with pytest.raises(InputError, match=r"path.entry_mm: expected one apart from the aim"):
         led_needle(entry_mm=(1.0, 2.0, 3.0), aim_mm=(1.0, 2.0, 3.0))
+    needle = "bodies.needle={path: {kind: insertion%s}}"
+    with pytest.raises(InputError, match=r"bodies.needle.path.depth_mm: expected greater than 0, found -5"):
+        load("sweep", ["out=unused", "rig=three_bodies", needle % ", depth_mm: -5"], sweep.Config)
+    with pytest.raises(InputError, match=r"bodies.needle.path.kind: .* a film has no B-scan .* sweep filmed=true"):
+        load("film", ["out=unused", "rig=three_bodies", needle % ""], Config)
+    load("film", ["out=unused", "rig=three_bodies", needle % ", aim_mm: [0, 0, 660], entry_mm: [20, 0, 640]"], Config)
 
 
 def test_films_have_paths_of_their_own():

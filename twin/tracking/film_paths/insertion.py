@@ -27,7 +27,7 @@ class Kind(FilmPath):
     seconds: Positive = 10.0  # a round
     rest_s: NotNegative = 2.0  # of it at the aim
     aim_mm: Vector | None = None  # of the tip, in the world; None: under the middle of the array, at depth_mm
-    depth_mm: Finite = 22.0  # of the aim, in the B-scan
+    depth_mm: Positive = 22.0  # of the aim, in the B-scan
     entry_mm: Vector | None = None  # from where the tip sets off, in the world; None: by the angles and travel_mm
     angle_deg: Annotated[float, Field(ge=0, le=90)] = 35.0  # of the shaft to the array's face; 0 is parallel
     heading_deg: Finite = 0.0  # of its way about the depth, from the array's own: 0 stays in the plane, 90 crosses it
