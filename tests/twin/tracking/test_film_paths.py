@@ -128,6 +128,30 @@ def test_the_needles_target_faces_the_cameras():
         )
 
 
+@pytest.mark.parametrize(("turn", "heading"), [(0, 180), (180, 0), (40, 180)])
+def test_a_needle_comes_from_where_both_cameras_see_its_target(turn, heading):
+    """In the B-scan's plane, whichever way the array is turned on the skin; what is given stays."""
+    rig, turned = read_rig("three_bodies"), np.deg2rad(turn)
+    across = [np.cos(turned), np.sin(turned), 0.0]
+    face = rigid.transform(np.column_stack([across, [0, 0, 1], np.cross(across, [0, 0, 1])]), [4.0, -2.0, 650.0])
+    target, cameras = rig.bodies["needle"], [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    path, aimed = insertion.Kind(), Aimed(NEEDLE.line_mm(target), face, cameras)
+    assert path.in_view(target, EYES, aimed).heading_deg == heading
+    way = path.lead(target, EYES, 0, aimed=aimed)
+    for time in SECONDS[::30]:
+        pose = way.pose(time)
+        for camera in cameras:
+            pixels = camera.project(rigid.apply(pose, circle_centres(target)))
+            assert (pixels > 30).all() and (pixels < np.array(camera.size) - 30).all()
+            sight = camera.centre - pose[:3, 3]
+            assert pose[:3, 2] @ sight > np.cos(np.radians(65)) * np.linalg.norm(sight)
+    given = insertion.Kind(heading_deg=10, angle_deg=70).in_view(target, EYES, aimed)
+    assert given.heading_deg == 10 and given.angle_deg == 70 and given.roll_deg is not None
+    aside = aimed._replace(world_from_face=rigid.transform(face[:3, :3], [400.0, 0.0, 650.0]))
+    led = path.in_view(target, EYES, aside)
+    assert (led.heading_deg, led.angle_deg, led.roll_deg) == (0, 35, 0), "where none is in view"
+
+
 def test_what_cannot_be_led_to_an_aim_is_refused(config):
     with pytest.raises(InputError, match="expected insertion for a body with a tip"):
         insertion.Kind().lead(config.rig.target, EYES, 0)
