@@ -75,7 +75,10 @@ def run(config: Config) -> None:
     count, moments = len(planned.plan.times), len(planned.plan.track.times)
     console.print(f"path        {led_along(config.path)}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
     for line, seen in places(planned):
-        console.print(line) if seen else ConsoleWatch().warn(line)
+        if seen:
+            console.print(line)
+        else:
+            ConsoleWatch().warn(line)
     unknown = sweep_session.PURPOSES[config.path.kind] == "probe"
     probe = None if unknown else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
@@ -122,7 +125,8 @@ def places(planned: PlannedSweep) -> Iterator[tuple[str, bool]]:
         line = f"{name:<11} target in view of both cameras at {viewed.sum()} of {len(viewed)} poses"
         if tip is not None:
             line += f"; tip in the slice in {tip.sum()} of {len(tip)} B-scans"
-        yield line, bool(viewed.any() and (tip is None or tip.any()))
+        seen = bool(viewed.any() and (tip is None or tip.any()))
+        yield line if seen else f"{line}; change bodies.{name}.path, or the probe's path", seen
 
 
 def led_along(path: AnyPath) -> str:
