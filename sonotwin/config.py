@@ -20,7 +20,7 @@ from pathlib import Path
 from secrets import token_hex
 from tempfile import TemporaryDirectory
 from textwrap import dedent, wrap
-from types import UnionType
+from types import MappingProxyType, UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
@@ -193,7 +193,7 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
     try:
         return model.model_validate(composed, context={"overrides": overrides})
     except ValidationError as error:
-        text = describe(error, model)
+        text = describe(error, model, composed)
         raise InputError(f"{_source(verb, overrides, text.partition(':')[0])}: {text}") from error
 
 
@@ -433,8 +433,11 @@ def _plain_value(verb: str, field: str, value: str) -> object:
         raise InputError(f"{verb}: {field}: expected balanced brackets and quotes, found {short(value)}") from error
 
 
-def describe(error: ValidationError, model: type[BaseModel]) -> str:
-    """Say the first of pydantic's complaints in one line: the field, what was expected, what was found, and how to mend it."""
+def describe(error: ValidationError, model: type[BaseModel], values: Mapping[str, Any] = MappingProxyType({})) -> str:
+    """Say the first of pydantic's complaints in one line: the field, what was expected, what was found, and how to mend it.
+
+    values : that were validated, by which a thing's kind is known
+    """
     first, *others = faults = error.errors(include_url=False)
     if first["type"] == "missing":  # for want of which a misspelled field stands there
         first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), first)
@@ -443,8 +446,9 @@ def describe(error: ValidationError, model: type[BaseModel]) -> str:
     match first["type"]:
         case "extra_forbidden":
             above, types = _place(model, first["loc"][:-1])
-            names = [name for one in types if _is_model(one) for name in one.model_fields]
-            text = f"{field}: {_expected(way[-1], names, above)}"
+            models = _of_the_kind(_below(values, above), [one for one in types if _is_model(one)])
+            names = dict.fromkeys(name for one in models for name in one.model_fields)
+            text = f"{field}: {_expected(way[-1], list(names), above)}"
         case "missing" if not isinstance(first["loc"][-1], int):
             text = f"{field}: needs a value; give {field}=..."
         case _:
@@ -492,6 +496,14 @@ def _of_kind(place: Sequence[str], model: type[BaseModel], given: Mapping[str, s
             if given.get(f"{key}.{tag}", named[1] if named else "").strip("'\"") in values:
                 return list(one.model_fields)
     return []
+
+
+def _of_the_kind(value: Any, models: list[type[BaseModel]]) -> list[type[BaseModel]]:
+    """Of models those whose kind a value names, or has where it names none; all of them if there are none such."""
+    given = value if isinstance(value, Mapping) else {}
+    return [
+        one for one in models if all(given.get(tag, getattr(one, "USUAL", None)) in values for tag, values in _tags(one).items())
+    ] or models
 
 
 def _below(tree: Any, way: Sequence[str]) -> Any:

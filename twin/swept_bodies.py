@@ -16,12 +16,14 @@ from twin import conditions
 from twin.tracking.film_path import STILL, Way
 from twin.tracking.film_paths import insertion
 from twin.tracking.led_bodies import LedBodies
+from twin.tracking.views_of_target import cameras_of, in_views
 from twin.ultrasound import scan_lines
 from twin.ultrasound.timed_sweep import Plan, PoseNoise, noisy
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
+SLICE_MM = 1.5  # of the B-scan to each side, in which a tip is seen; assumed, about a linear array's at its focus
 STREAM = 16  # of random numbers, apart from those of the probe's poses
 
 
@@ -32,7 +34,7 @@ class SweptBody:
     look: Look
     target: Target
     way: Way  # at any time of the path, s
-    track: Track  # world_from_target by the cameras: (m,), stamped as the probe's poses
+    track: Track  # world_from_target by the cameras: (m,), stamped as the probe's poses; not found where a view lacks a circle
     truth: Track  # the same at the cameras' moments
     scanned: Track  # reference_from_target at the moments when the n images are taken; the patient may have moved since
 
@@ -40,6 +42,20 @@ class SweptBody:
     def shaft(self) -> Shaft | None:
         """The shaft that sound meets, in the target's frame; None of a body that stays outside."""
         return self.look.shaft(self.target)
+
+    def in_view(self, rig: Rig) -> NDArray[np.bool_]:
+        """Whether both cameras have its target in view : (m,), as of `in_views`."""
+        return in_views(self.truth.poses, self.target, cameras_of(rig))
+
+    def in_slice(self, world_from_image: Array, rig: Rig) -> NDArray[np.bool_] | None:
+        """Whether its tip lies in the B-scans : (n,) of poses (n, 4, 4), within their slice; None of a body without a tip."""
+        tip = self.look.tip_mm(self.target)
+        if tip is None:
+            return None
+        tips = [rigid.apply(rigid.invert(one) @ own, tip) for one, own in zip(world_from_image, self.scanned.poses, strict=True)]
+        shown, beside = np.split(np.array(tips), [2], axis=1)
+        size_mm = np.array(rig.probe.scale_mm_per_px) * (np.array(rig.probe.image_size) - 1)
+        return ((shown >= 0) & (shown <= size_mm)).all(axis=1) & (np.abs(beside[:, 0]) <= SLICE_MM)
 
 
 def lead(
@@ -68,6 +84,7 @@ def lead(
         way = led.lead(name, path, rig, face, seed, errors)
         truth, scanned = (_along(way, moments) for moments in (plan.target.times, plan.truth.times))
         seen = noisy(truth.poses, noise, np.random.default_rng([seed, STREAM, number]))
+        seen[~in_views(truth.poses, target, cameras_of(rig))] = np.nan
         bodies[name] = SweptBody(look, target, way, Track(plan.track.times, seen), truth, scanned)
     return bodies
 

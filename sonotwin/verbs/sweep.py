@@ -12,7 +12,8 @@ are then in these frames, for `sonotwin track`, and nowhere else. Takes about a 
 bodies of the rig, too. With `moved` the patient, the scene and all over it, has moved by a rigid step since the fringes.
 
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
-B-scans that they are led to.
+B-scans that they are led to. Poses are found where both cameras have the body's target in view: a line for each body says in how
+many, and warns of none.
 
     sonotwin sweep out=outputs/sweep
     sonotwin sweep conditions=lifelike out=outputs/sweep
@@ -22,7 +23,7 @@ B-scans that they are led to.
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
     sonotwin sweep scene=plane ultrasound=water path=tilts out=outputs/wall
     sonotwin sweep scene=sphere ultrasound=water path=tilts out=outputs/ball
-    sonotwin sweep rig=three_bodies path=hold 'bodies.needle={path: {kind: insertion, angle_deg: 50}}' out=outputs/needle
+    sonotwin sweep rig=three_bodies path=hold 'bodies.needle={path: {kind: insertion, depth_mm: 18}}' out=outputs/needle
 """
 
 from collections.abc import Iterable, Iterator
@@ -34,7 +35,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SCANNER, sweep_part
-from sonotwin.console_watch import LineConsole
+from sonotwin.console_watch import ConsoleWatch, LineConsole
 from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
@@ -73,6 +74,11 @@ def run(config: Config) -> None:
         film = filming(planned, console) if config.filmed else None
     count, moments = len(planned.plan.times), len(planned.plan.track.times)
     console.print(f"path        {led_along(config.path)}, {count} B-scans, {moments} {'pairs of frames' if film else 'poses'}")
+    for line, seen in places(planned):
+        if seen:
+            console.print(line)
+        else:
+            ConsoleWatch().warn(line)
     unknown = sweep_session.PURPOSES[config.path.kind] == "probe"
     probe = None if unknown else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
@@ -109,6 +115,18 @@ def shown(planned: PlannedSweep, console: Console) -> Iterator[Scan]:
     """Take the images, in order, and show how far it is."""
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         yield from progress.track(planned.scans(), total=len(planned.plan.times), description="rendering B-scans")
+
+
+def places(planned: PlannedSweep) -> Iterator[tuple[str, bool]]:
+    """A line for each further body, where cameras and scanner see it, and whether each of them does at all."""
+    for name, body in planned.bodies.items():
+        rig = planned.settings.rig
+        viewed, tip = body.in_view(rig), body.in_slice(planned.plan.truth.poses, rig)
+        line = f"{name:<11} target in view of both cameras at {viewed.sum()} of {len(viewed)} poses"
+        if tip is not None:
+            line += f"; tip in the slice in {tip.sum()} of {len(tip)} B-scans"
+        seen = bool(viewed.any() and (tip is None or tip.any()))
+        yield line if seen else f"{line}; change bodies.{name}.path, or the probe's path", seen
 
 
 def led_along(path: AnyPath) -> str:

@@ -130,7 +130,7 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
     [
         (["scene=ball_bar"], "scene: ball_bar: expected one with acoustics (breast,"),
         (["scene=tank", "path.surface=breast"], "path.surface: expected one of tank, found breast"),
-        (["scene=tank"], "path.surface: expected a scene with a solid to stroke over, found none"),
+        (["scene=tank"], "path.surface: needs a value: the scene has no more than tank; give path.surface=tank"),
         (["scene=tank", "path.surface=tank", "path.start_mm=[4,90]"], "path: expected the probe over tank, found it beside at"),
         (["scene=tank", "path.surface=tank", "path.end_mm=[4,-35]"], "end_mm: expected a stroke of some length, found 0 mm"),
         (["scene=tank", "path=wire"], "path: expected a scene of two crossed wires, such as scene=crosswire, found no wires"),
@@ -158,6 +158,10 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
         (
             ["rig=three_bodies", "bodies.patient={path: {kind: insertion}}"],
             "bodies.patient.path.kind: expected insertion for a body with a tip, such as a needle",
+        ),
+        (
+            ["rig=three_bodies", "bodies.patient={path: {kind: still, place_mm: [0, 0, 650], speed: 2}}"],
+            "bodies.patient.path.speed: unknown key; expected one of kind, place_mm, roll_deg\n",
         ),
     ],
 )

@@ -6,6 +6,7 @@ import pytest
 from recon.capture.sweep_part import read_sweep
 from recon.geometry import rigid
 from recon.model import tracks
+from recon.model.circle_layout import circle_centres
 from sonotwin import config
 from sonotwin.cli import main
 from sonotwin.verbs.sweep import Config
@@ -39,6 +40,58 @@ def test_the_needle_is_in_the_b_scan_and_tracked_to_the_noise():
     np.testing.assert_allclose(between, one.scanned.poses[:-1], atol=0.05)
 
 
+def test_poses_that_a_camera_has_not_in_view_are_not_found():
+    """A board led sideways out of the image: found where the calibrated projection of all its circles lies inside."""
+    led = "bodies.patient={path: {kind: hand, seconds: 4, places_mm: [[0,60,650],[-70,60,650],[-160,60,650]], turn_deg: 0}}"
+    made = planned(led)
+    one, rig = made.bodies["patient"], made.settings.rig
+    inside = np.ones(len(one.truth.poses), bool)
+    for device in (rig.cam1, rig.cam2):
+        camera = device.optics.camera()
+        pixels = np.array([camera.project(rigid.apply(pose, circle_centres(one.target))) for pose in one.truth.poses])
+        radius = 0.5 * one.target.outer_diameter_mm * camera.matrix[0, 0] / 650
+        inside &= ((pixels > radius) & (pixels < np.array(camera.size) - 1 - radius)).all(axis=(1, 2))
+    assert 20 < inside.sum() < len(inside) - 20
+    assert np.count_nonzero(one.track.found != inside) <= 4, "of a pixel at the edges"
+    np.testing.assert_array_equal(one.track.found, one.in_view(rig))
+    assert np.isfinite(one.truth.poses).all() and np.isfinite(one.scanned.poses).all()
+
+
+def test_it_is_said_how_often_cameras_and_scanner_see_a_body(tmp_path, capsys):
+    """The needle that nothing is said of is in view throughout; one beside both views is not found, and is warned of."""
+    fields = ["path.seconds=1", "clocks.scanner_hz=4", "clocks.camera_hz=10"]
+    for name, way, said in (
+        (
+            "seen",
+            "seconds: 1, rest_s: 0.6, depth_mm: 12, unsteady_mm: 0",
+            "view of both cameras at 11 of 11 poses; tip in the slice in",
+        ),
+        (
+            "unseen",
+            "heading_deg: 0, angle_deg: 35",
+            "needle      target in view of both cameras at 0 of 11 poses; tip in the slice in 0 of 5 B-scans",
+        ),
+    ):
+        body = f"bodies.needle={{path: {{kind: insertion, {way}}}}}"
+        assert main(["sweep", f"out={tmp_path / name}", *FIELDS[:-1], *fields, body]) == 0
+        printed = capsys.readouterr()
+        assert said in (printed.out if name == "seen" else printed.err) and said not in (
+            printed.err if name == "seen" else printed.out
+        )
+        found = read_sweep(tmp_path / name / "capture").bodies["needle"].found
+        assert found.all() if name == "seen" else not found.any()
+
+
+def test_a_tip_is_in_the_slice_within_the_image_and_near_its_plane():
+    """5 mm beside the plane it isn't; nor below the image, which is 15 mm deep."""
+    counts = []
+    for aim in ("depth_mm: 12", "depth_mm: 12, beside_mm: 5", "depth_mm: 22"):
+        made = planned(f"bodies.needle={{path: {{kind: insertion, seconds: 4, rest_s: 3.8, travel_mm: 6, {aim}}}}}")
+        counts.append(made.bodies["needle"].in_slice(made.plan.truth.poses, made.settings.rig).mean())
+    assert counts[0] > 0.9 and counts[1:] == [0, pytest.approx(0, abs=0.1)]
+    assert made.bodies["patient"].in_slice(made.plan.truth.poses, made.settings.rig) is None
+
+
 def test_the_hand_trembles_and_the_post_does_not():
     still, shaken = (planned(f"conditions.motion.tremor_mm={size}").bodies for size in (0, 0.3))
     moved = {name: shaken[name].truth.poses[:, :3, 3] - still[name].truth.poses[:, :3, 3] for name in still}
@@ -70,7 +123,8 @@ def test_a_capture_has_their_poses_and_the_truth_has_both_clocks(tmp_path):
 def test_the_needle_is_seen_in_the_b_scans_at_its_tip(tmp_path):
     """Within 5 px of the true tip, at the rest, all is brighter than without it."""
     fields = ["rig=three_bodies", "scene=test_object", "path=hold", "path.seconds=1", "clocks.scanner_hz=3"]
-    needle = "{look: {kind: needle, etched_mm: 3}, path: {kind: insertion, seconds: 1, rest_s: 0.9, travel_mm: 5, depth_mm: 12}}"
+    path = "{kind: insertion, seconds: 1, rest_s: 0.9, travel_mm: 5, depth_mm: 12, angle_deg: 35, heading_deg: 0}"
+    needle = f"{{look: {{kind: needle, etched_mm: 3}}, path: {path}}}"
     for name, body in (("with", needle), ("without", "{path: {kind: insertion, beside_mm: 40}}")):
         assert main(["sweep", f"out={tmp_path / name}", f"bodies.needle={body}", *fields]) == 0
     shown, plain = (list(read_sweep(tmp_path / name / "capture").images()) for name in ("with", "without"))

@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from recon.geometry import rigid
+from recon.geometry.camera import Camera
 from recon.model.part import Kinds
 from recon.model.rig import Target
 from twin import conditions
@@ -60,6 +61,7 @@ class Aimed(NamedTuple):
 
     line_mm: Array | None  # (2, 3) from the shaft's rear end to the tip, in the target's frame; None of a body without a tip
     world_from_face: Array  # (4, 4) mm: the middle of the array's face, x along it, y into the depth
+    cameras: Sequence[Camera] = ()  # that are to see the target
 
 
 class FilmPath(Kinds):

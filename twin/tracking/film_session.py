@@ -26,6 +26,7 @@ from twin import conditions
 from twin.session import Session, describe
 from twin.shooting import FilmQuality, Quality, Shooting
 from twin.tracking.film_path import STILL, FilmPath, Way
+from twin.tracking.film_paths import insertion
 from twin.tracking.led_bodies import LedBodies
 from twin.tracking.mesh_bank import Bank, bank_of, build_bank, uncovered, uncovered_share
 from twin.tracking.rendered_views import Frames, Views, render_film, render_full, white_radiance
@@ -57,6 +58,16 @@ class Filming(Shooting, LedBodies):
     def _one_after_the_other(self) -> "Filming":
         if self.exposure_s * self.camera_hz > 1:
             raise ValueError(f"exposure_s: expected at most 1 / camera_hz = {1 / self.camera_hz:.4g}, found {self.exposure_s:g}")
+        return self
+
+    @model_validator(mode="after")
+    def _without_b_scans(self) -> "Filming":
+        for name, body in self.bodies.items():
+            if isinstance(body.path, insertion.Kind) and (body.path.aim_mm is None or body.path.entry_mm is None):
+                raise ValueError(
+                    f"bodies.{name}.path.kind: expected another than insertion, as a film has no B-scan to lead it to: "
+                    "give aim_mm and entry_mm in the world, or render it by sonotwin sweep filmed=true"
+                )
         return self
 
     @property

@@ -12,6 +12,7 @@ from scenes.handheld.body_look import Look, look_of
 from twin import conditions
 from twin.tracking.film_path import STILL, Aimed, FilmPath, Way
 from twin.tracking.film_paths import hand, still
+from twin.tracking.views_of_target import cameras_of
 
 Array = NDArray[np.float64]
 
@@ -89,8 +90,9 @@ class LedBodies(Part):
             If the path isn't one for such a body.
         """
         look, target, number = self.look(name), rig.bodies[name], list(rig.bodies).index(name) + 1
-        eyes = np.mean([device.optics.camera().centre for device in (rig.cam1, rig.cam2)], axis=0)
-        aimed = Aimed(look.line_mm(target), world_from_face)
+        cameras = cameras_of(rig)
+        eyes = np.mean([camera.centre for camera in cameras], axis=0)
+        aimed = Aimed(look.line_mm(target), world_from_face, cameras)
         try:
             return path.lead(target, eyes, seed, errors if look.IN_A_HAND else STILL, [number], aimed)
         except InputError as error:

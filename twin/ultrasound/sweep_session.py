@@ -118,9 +118,14 @@ def surface_of(name: str, body: Body) -> Solid:
     if name in named:
         return named[name]
     others = [solid for solid in body.solids if solid.name not in SUPPORTS]
-    if name or not others:
-        expected = f"one of {', '.join(named) or 'nothing'}" if name else "a scene with a solid to stroke over"
-        raise InputError(f"path.surface: expected {expected}, found {name or 'none'}")
+    if not named:
+        raise InputError("path.surface: expected a scene of solid things, found one without")
+    if name:
+        raise InputError(f"path.surface: expected one of {', '.join(named)}, found {name}")
+    if not others:
+        raise InputError(
+            f"path.surface: needs a value: the scene has no more than {', '.join(named)}; give path.surface={next(iter(named))}"
+        )
     return others[0]
 
 

@@ -51,6 +51,17 @@ def test_it_tilts_to_all_sides_and_turns(config):
     assert len({tuple(side) for side in np.sign(across[tilt > 20]).tolist()}) == 4
 
 
+def test_a_needle_pivots_about_its_own_tip():
+    """Where no other is given; it stays in the dimple, where the path's usual tip doesn't."""
+    body = "bodies.needle={path: {kind: pivot, middle_mm: [12, -28, 700]%s}}"
+    for given, rests in (("", True), (", tip_mm: [0, -120, -30]", False)):
+        config = load("film", ["out=unused", "rig=three_bodies", body % given], Config)
+        target = config.rig.bodies["needle"]
+        way = config.lead("needle", config.path_of("needle", 0), config.rig, np.eye(4), 0, Motion())
+        tips = np.array([rigid.apply(way.pose(time), config.look("needle").tip_mm(target)) for time in SECONDS[::10]])
+        assert (np.ptp(tips, axis=0).max() < 1e-9) == rests
+
+
 def test_both_cameras_see_the_circles_whole(config):
     rig, way = takes.rig(), config.path.lead(config.rig.target, EYES, 3)
     cameras = [getattr(rig, name).optics.camera() for name in ("cam1", "cam2")]
@@ -117,11 +128,41 @@ def test_the_needles_target_faces_the_cameras():
         )
 
 
+@pytest.mark.parametrize(("turn", "heading"), [(0, 180), (180, 0), (40, 180)])
+def test_a_needle_comes_from_where_both_cameras_see_its_target(turn, heading):
+    """In the B-scan's plane, whichever way the array is turned on the skin; what is given stays."""
+    rig, turned = read_rig("three_bodies"), np.deg2rad(turn)
+    across = [np.cos(turned), np.sin(turned), 0.0]
+    face = rigid.transform(np.column_stack([across, [0, 0, 1], np.cross(across, [0, 0, 1])]), [4.0, -2.0, 650.0])
+    target, cameras = rig.bodies["needle"], [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    path, aimed = insertion.Kind(), Aimed(NEEDLE.line_mm(target), face, cameras)
+    assert path.in_view(target, EYES, aimed).heading_deg == heading
+    way = path.lead(target, EYES, 0, aimed=aimed)
+    for time in SECONDS[::30]:
+        pose = way.pose(time)
+        for camera in cameras:
+            pixels = camera.project(rigid.apply(pose, circle_centres(target)))
+            assert (pixels > 30).all() and (pixels < np.array(camera.size) - 30).all()
+            sight = camera.centre - pose[:3, 3]
+            assert pose[:3, 2] @ sight > np.cos(np.radians(65)) * np.linalg.norm(sight)
+    given = insertion.Kind(heading_deg=10, angle_deg=70).in_view(target, EYES, aimed)
+    assert given.heading_deg == 10 and given.angle_deg == 70 and given.roll_deg is not None
+    aside = aimed._replace(world_from_face=rigid.transform(face[:3, :3], [400.0, 0.0, 650.0]))
+    led = path.in_view(target, EYES, aside)
+    assert (led.heading_deg, led.angle_deg, led.roll_deg) == (0, 35, 0), "where none is in view"
+
+
 def test_what_cannot_be_led_to_an_aim_is_refused(config):
     with pytest.raises(InputError, match="expected insertion for a body with a tip"):
         insertion.Kind().lead(config.rig.target, EYES, 0)
     with pytest.raises(InputError, match=r"path.entry_mm: expected one apart from the aim"):
         led_needle(entry_mm=(1.0, 2.0, 3.0), aim_mm=(1.0, 2.0, 3.0))
+    needle = "bodies.needle={path: {kind: insertion%s}}"
+    with pytest.raises(InputError, match=r"bodies.needle.path.depth_mm: expected greater than 0, found -5"):
+        load("sweep", ["out=unused", "rig=three_bodies", needle % ", depth_mm: -5"], sweep.Config)
+    with pytest.raises(InputError, match=r"bodies.needle.path.kind: .* a film has no B-scan .* sweep filmed=true"):
+        load("film", ["out=unused", "rig=three_bodies", needle % ""], Config)
+    load("film", ["out=unused", "rig=three_bodies", needle % ", aim_mm: [0, 0, 660], entry_mm: [20, 0, 640]"], Config)
 
 
 def test_films_have_paths_of_their_own():

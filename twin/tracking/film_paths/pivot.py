@@ -17,6 +17,7 @@ from twin.tracking.film_path import STILL, Aimed, FilmPath, Way, facing
 Array = NDArray[np.float64]
 
 STEPS = 96  # of a round, between which it is smooth
+TIP_MM = (0.0, -120.0, -30.0)  # in the target's frame: below the circles, as of a pointer that is held like a pen
 ROUNDS = (2, 3, 1)  # of both tilts and of the turn, in one round of the path: tilts of all sizes, upright among them
 
 
@@ -25,7 +26,7 @@ class Kind(FilmPath):
 
     kind: Literal["pivot"] = "pivot"
     seconds: Positive = 10.0  # a round
-    tip_mm: Vector = (0.0, -120.0, -30.0)  # in the target's frame
+    tip_mm: Vector | None = None  # in the target's frame; None: the body's own, or TIP_MM where it has none
     middle_mm: Vector  # of the circles' middle in the world, of the tool upright, its face to the cameras
     roll_deg: Finite = 0.0  # of the target's x axis in the image then, from left to right
     tilt_deg: Annotated[float, Field(ge=0, le=60)] = 25.0  # at most, about each of two axes across the shaft
@@ -41,7 +42,7 @@ class Kind(FilmPath):
         aimed: Aimed | None = None,
     ) -> Way:
         """Lead it about the tip; the seed tells where it begins."""
-        middle, tip = circle_layout.middle(target), np.array(self.tip_mm, float)
+        middle, tip = circle_layout.middle(target), self._tip(aimed)
         first = facing(eyes - np.array(self.middle_mm, float), self.roll_deg)
         shaft = first @ (middle - tip) / np.linalg.norm(middle - tip)
         across = np.linalg.svd(shaft[None])[2][1:]
@@ -51,21 +52,27 @@ class Kind(FilmPath):
         turned = (tilts * Rotation.from_rotvec(np.deg2rad(self.turn_deg) * parts[:, 2:] * shaft)).as_rotvec()
         turned[-1] = turned[0]
         times = np.linspace(0, self.seconds, STEPS + 1)
-        dimple = np.tile(self.dimple_mm(target, eyes), (STEPS + 1, 1))
+        dimple = np.tile(self.dimple_mm(target, eyes, aimed), (STEPS + 1, 1))
         rest = CubicSpline(times, dimple, bc_type="periodic")
         still = errors.model_copy(update={"tremor_mm": 0.0})
         return Way(rest, CubicSpline(times, turned, bc_type="periodic"), first, tip, conditions.trembling(still, seed, *body))
 
-    def dimple_mm(self, target: Target, eyes: Array) -> Array:
+    def dimple_mm(self, target: Target, eyes: Array, aimed: Aimed | None = None) -> Array:
         """Place of the tip in the world : (3,) mm."""
         first = facing(eyes - np.array(self.middle_mm, float), self.roll_deg)
-        return np.array(self.middle_mm) + first @ (np.array(self.tip_mm) - circle_layout.middle(target))
+        return np.array(self.middle_mm) + first @ (self._tip(aimed) - circle_layout.middle(target))
 
     @property
     def room_mm(self) -> Array:
         """Behind the tool, however it is tilted."""
-        return np.add(self.middle_mm, [0.0, 0.0, np.linalg.norm(self.tip_mm) * np.sin(np.deg2rad(self.tilt_deg))])
+        return np.add(self.middle_mm, [0.0, 0.0, np.linalg.norm(self._tip()) * np.sin(np.deg2rad(self.tilt_deg))])
 
     def truth(self, target: Target) -> Mapping[str, Array]:
         """The tip, in the target's frame."""
-        return {"tip_mm": np.array(self.tip_mm, float)}
+        return {"tip_mm": self._tip()}
+
+    def _tip(self, aimed: Aimed | None = None) -> Array:
+        """As given, or else the body's own : (3,) mm in the target's frame."""
+        if self.tip_mm is None and aimed is not None and aimed.line_mm is not None:
+            return aimed.line_mm[-1]
+        return np.array(TIP_MM if self.tip_mm is None else self.tip_mm, float)
