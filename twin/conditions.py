@@ -206,6 +206,13 @@ def drifted(rig: Rig, errors: Drift, *key: int) -> Rig:
     return rig.model_copy(update=changed)
 
 
+def in_use(rig: Rig, life: Conditions, seed: int) -> Rig:
+    """Draw the rig as it is in use: its devices have drifted, and the targets of all bodies are as they were printed."""
+    bodies = {name: printed(target, life.target, seed, number) for number, (name, target) in enumerate(rig.bodies.items(), 1)}
+    targets = {"target": printed(rig.target, life.target, seed), "bodies": bodies}
+    return drifted(rig, life.drift, seed).model_copy(update=targets)
+
+
 def check_board(design: board.Config, errors: BoardPrint) -> None:
     """Refuse errors by which a drawn board may have discs that touch, or leave it.
 

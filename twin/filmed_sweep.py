@@ -15,7 +15,7 @@ from recon.model.tracks import Track
 from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from twin import swept_bodies
-from twin.conditions import Conditions, drifted, printed
+from twin.conditions import Conditions, in_use
 from twin.shooting import FrameShooting
 from twin.swept_bodies import SweptBody
 from twin.tracking.led_bodies import LedBodies, check_names
@@ -140,10 +140,7 @@ class PlannedSweep:
         from twin.tracking import film_session, scene_frames  # load the ray tracer, which B-scans do without
 
         settings, target, moved = self.settings, self.plan.target, self.world_from_reference
-        errors, seed = settings.conditions.target, settings.seed
-        rig = drifted(settings.rig, settings.conditions.drift, seed)
-        prints = {name: printed(one, errors, seed, number) for number, (name, one) in enumerate(rig.bodies.items(), 1)}
-        rig = rig.model_copy(update={"target": printed(rig.target, errors, seed), "bodies": prints})
+        rig = in_use(settings.rig, settings.conditions, settings.seed)
         exposure_s = settings.frames.exposure_s
         own = scene_frames.motions(target.poses(), target.poses(-exposure_s / 2), target.poses(exposure_s / 2))
         led = {PROBE: own}
@@ -151,7 +148,7 @@ class PlannedSweep:
             led[name] = [one.way.motion(time * 1e-9, exposure_s) for time in target.times.tolist()]
         led = {name: [motion.carried(moved) for motion in motions] for name, motions in led.items()}
         stage = scene_frames.SceneStage(self.scene, moved, led, {name: one.look for name, one in self.bodies.items()})
-        bank = scene_frames.make_bank(stage, rig, seed)
+        bank = scene_frames.make_bank(stage, rig, settings.seed)
         made = scene_frames.takes(stage, bank, rig, ranges, settings.frames, settings.own_seed, settings.conditions.motion)
 
         def frames() -> Iterable["Frames"]:

@@ -26,7 +26,7 @@ from recon.capture.manifest import CAMERAS, SweepNameOrNone, sweep_part
 from recon.model.rig import Rig
 from sonotwin.config import folder as conf
 from sonotwin.console_watch import LineConsole
-from twin.conditions import Conditions, drifted, printed
+from twin.conditions import Conditions, in_use
 from twin.session import Session
 from twin.shooting import FilmQuality
 from twin.tracking import film_session
@@ -66,10 +66,7 @@ def run(config: Config) -> None:
         config.out, sweep_part(config.name), config.model_dump(mode="json", exclude={"out", "add"}), config.add, CAMERAS
     )
     session.check()
-    rig = drifted(config.rig, config.conditions.drift, config.seed)
-    errors, bodies = config.conditions.target, enumerate(rig.bodies.items(), 1)
-    prints = {name: printed(target, errors, config.seed, number) for number, (name, target) in bodies}
-    rig = rig.model_copy(update={"target": printed(rig.target, errors, config.seed), "bodies": prints})
+    rig = in_use(config.rig, config.conditions, config.seed)
     with console.status("setting up the scene"):
         bank = film_session.make_bank(rig, ranges(), config, config.seed)
         made = film_session.takes(bank, rig, ranges(), config, config.seed, config.conditions.motion)

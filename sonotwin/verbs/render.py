@@ -34,7 +34,7 @@ from scenes.catalogue import build_scene, parse_scene
 from scenes.scene_types import Scene
 from sonotwin.console_watch import LineConsole
 from twin import board_session
-from twin.conditions import IDEAL, Conditions, check_board, drifted, printed
+from twin.conditions import IDEAL, Conditions, check_board, in_use
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.session import Session
@@ -160,9 +160,7 @@ def render_poses(settings: board_session.Settings, placed: Array, session: Sessi
 
 def set_up(config: Config) -> tuple[Rig, Scene, dict[str, Array]]:
     """The rig as it is in use, the scene with what stands beside it, and the poses `world_from_target` of that by name."""
-    rig, errors = drifted(config.rig, config.conditions.drift, config.seed), config.conditions.target
-    prints = {name: printed(one, errors, config.seed, k) for k, (name, one) in enumerate(rig.bodies.items(), 1)}
-    rig = rig.model_copy(update={"bodies": prints})
+    rig = in_use(config.rig, config.conditions, config.seed)
     return rig, *with_standing(build_scene(config.scene), rig, config.rig, config, config.seed)
 
 
