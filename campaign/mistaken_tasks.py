@@ -244,10 +244,10 @@ def _wired(name: str, source: str, fields: Line, mistakes: tuple[Mistake, ...], 
 
 ROWED = ("phantom=n_wires",)
 WIRED = (
-    _wired("crossed wires", "wires", (), (
-        *_set_up("wires"), Mistake("device", "N-wires", r"dots|rows|phantom|wires", given("phantom=n_wires"))
+    _wired("crossed wires", "wires_in_full", (), (
+        *_set_up("wires_in_full"), Mistake("device", "N-wires", r"dots|rows|phantom|wires", given("phantom=n_wires"))
     )),
-    _wired("N-wires", "rows", ROWED, (*_set_up("rows"), *probe_mistakes.of_rows())),
+    _wired("N-wires", "rows_in_full", ROWED, (*_set_up("rows_in_full"), *probe_mistakes.of_rows())),
     *(
         _wired(f"{name} in motion", source, (*fields, "lag_s=0.05"), tuple(
             probe_mistakes.of_lag(f"{source}/capture/sweep/us/timestamps.csv")

@@ -15,9 +15,9 @@ from recon.model.wire_phantom import FCAL_2
 
 Array = NDArray[np.float64]
 
-MOVED = r"mov|slip|gives|push|at rest|contradict"
-PHANTOM = r"phantom|wires|definition|strung|hole|front and back"
-LATE = r"late|early|lag"
+MOVED = r"slip|gives|pushed|moved against|moved by"
+PHANTOM = r"another phantom|defin|strung|hole|front and back|sides of all N-wires parallel"
+LATE = r"with lag_s=|are late|are early|lag_s=free"
 FCAL_1 = (  # mm, front and back of each wire: PLUS's phantom fCal 1, of two N-wires
     (((20, 0, 5), (20, 40, 5)), ((25, 0, 5), (45, 40, 5)), ((50, 0, 5), (50, 40, 5))),
     (((20, 0, 0), (20, 40, 0)), ((45, 0, 0), (25, 40, 0)), ((50, 0, 0), (50, 40, 0))),
@@ -52,7 +52,7 @@ def of_motion(table: str) -> list[Mistake]:
             for what, how in (("phantom moved half-way", _tank), ("probe slipped half-way", lambda poses, step: poses @ step))
             for least, most in ((2, 5), (5, 20))
         ),
-        Mistake("frames", "poses in another body's frame, which moves", r"rest|contradict|" + MOVED, track(table, _of_a_hand)),
+        Mistake("frames", "poses in another body's frame, which moves", r"another body|" + MOVED, track(table, _of_a_hand)),
     ]
 
 

@@ -29,6 +29,8 @@ MADE = (  # command lines in the order in which they are run
     ("render", "scene=sphere", "cameras=[cam1,cam2]", "tracing.samples=4", "out=both"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=12", "out=wires"),
     ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "path.count=12", "out=rows"),
+    ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "out=wires_in_full"),
+    ("sweep", "scene=n_wires", "ultrasound=water", "path=rows", "out=rows_in_full"),
     ("sweep", "scene=plane", "ultrasound=water", "path=tilts", "path.count=20", "out=wall"),
     ("sweep", "scene=sphere", "ultrasound=water", "path=tilts", "path.count=20", "out=sphere"),
     ("sweep", "scene=crosswire", "ultrasound=water", "path=wire", "path.count=9", *MOVING, "path.roll_deg=60", "out=moving"),

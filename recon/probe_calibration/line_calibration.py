@@ -66,8 +66,7 @@ MAX_SIZE = 0.03  # beyond which it is another phantom
 MOST_COURSES = 40  # of a sudden movement, evenly over the frames
 LARGE = np.array([*np.radians(np.full(3, 5.0)), *np.full(3, 5.0)])  # rad and mm, 1 sigma of half a movement beforehand
 MOST_ASTRAY = 1  # wires of which most dots lie elsewhere
-MOST_TRIED, DRAWS_TRIED = 24, 20  # frames and random starts, of a refusal
-UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
+DRAWS_TRIED = 20  # random starts, of a quick look
 FLAT_MM = 1.0  # depth of all rows, below which there is but one
 
 
@@ -536,8 +535,8 @@ def calibrate(
     rms = _rms(_residuals(found.estimate, problem)[found.inliers])
     astray = (found.inliers.mean(axis=0) < MIN_INLIERS).sum()
     contradict = found.level > MAX_FACTOR or rms > MAX_RMS_MM or found.inliers.mean() < MIN_INLIERS or astray > MOST_ASTRAY
-    if contradict or not _plausible(found.estimate):
-        _say_why(problem, found, rms, numbers)
+    if contradict or not probe_checks.plausible(found.estimate.scale):
+        _refuse(problem, found, rms, numbers)
     several = np.repeat(problem.frames.poses, problem.phantom.count, axis=0), problem.frames.pixels.reshape(-1, 2)
     if wires.registration is None:
         probe_checks.motion(*several, size)
@@ -588,10 +587,12 @@ def calibrate(
 
 
 def misfit(sightings: DotSightings, wires: Wires, noise: Noise) -> float:
-    """Mean square distance, mm^2, of the dots from their wires, each counted up to MAX_RMS_MM; infinite for few frames."""
+    """As `point_calibration.misfit`, of the dots from their wires."""
     if len(sightings.poses) < MIN_FRAMES:
         return np.inf
     problem, start = _arranged(sightings, wires, noise, np.random.default_rng(0), DRAWS_TRIED, refined=1)
+    if not probe_checks.plausible(start.scale):
+        return MAX_RMS_MM**2
     return float(np.minimum((_residuals(start, problem) ** 2).sum(axis=-1), MAX_RMS_MM**2).mean())
 
 
@@ -813,22 +814,8 @@ def _held_out(problem: _Problem, found: _Fit, start: _Estimate) -> float:
     return _rms(np.concatenate(left))
 
 
-def _plausible(estimate: _Estimate) -> bool:
-    """Whether the scales are those of a scanner; poses that hardly move fit an image that is a point."""
-    return bool(((estimate.scale >= probe_checks.SCALES[0]) & (estimate.scale <= probe_checks.SCALES[1])).all())
-
-
-def _say_why(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int64] | None) -> None:
-    """Refuse dots that don't lie on the wires of a phantom at rest, and name the reading under which they would."""
-    some = np.unique(np.linspace(0, len(found.inliers) - 1, MOST_TRIED).astype(int))
-    few, misfits = problem.of(some), {}
-    for meaning, other in _readings(few):
-        start = _robust_start(other, np.random.default_rng(0), DRAWS_TRIED, refined=1)
-        misfits[meaning] = float(np.sqrt(_median(start, other))) if _plausible(start) else np.inf
-    likely = min(misfits, key=lambda meaning: misfits[meaning], default="")
-    half = _rms(_residuals(found.estimate, problem)) / 2 if _plausible(found.estimate) else np.inf
-    if likely and misfits[likely] < min(half, MAX_RMS_MM):
-        raise InputError(f"dots: expected on the wires of a phantom at rest, found {likely}: read so, they are")
+def _refuse(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int64] | None) -> None:
+    """Refuse dots that don't lie on the wires of a phantom at rest."""
     away = np.sqrt((_residuals(found.estimate, problem) ** 2).sum(axis=-1).mean(axis=1))
     names = np.arange(len(away)) if numbers is None else numbers
     farthest = ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
@@ -837,20 +824,3 @@ def _say_why(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int
         f"residuals of {rms:.1f} mm (rms), {found.level:.1f} times the assumed noise, of the {agree:.0f} % of the dots that agree"
     )
     raise InputError(f"dots: expected on the wires of a phantom at rest, found {noise}; farthest off: {farthest}")
-
-
-def _readings(problem: _Problem) -> Iterator[tuple[str, _Problem]]:
-    """Common mistakes, each with the problem as it would be without."""
-    frames, phantom = problem.frames, problem.phantom
-    free = replace(problem, wires=replace(problem.wires, registration=None))
-    for meaning, poses in probe_checks.readings(frames.poses).items():
-        yield f"poses of {meaning}", replace(free, frames=replace(frames, poses=poses))
-    for unit, length in UNITS.items():
-        poses = frames.poses.copy()
-        poses[:, :3, 3] *= length
-        yield f"poses in {unit}", replace(free, frames=replace(frames, poses=poses))
-    rows = range(len(phantom.ends))
-    for reversed_ in dict.fromkeys([*((row,) for row in rows), tuple(rows)]):
-        which = f"N-wire {reversed_[0] + 1}" if len(reversed_) == 1 else "all N-wires"
-        other = phantom.restrung(list(reversed_))
-        yield f"front and back exchanged of the diagonal of {which}", replace(free, wires=replace(free.wires, phantom=other))

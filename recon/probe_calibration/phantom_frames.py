@@ -1,7 +1,7 @@
 """Frames of a probe's calibration: in which of them the phantom was found, and the reasons in the others."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -104,6 +104,7 @@ class PhantomFrames:
     first_row: int = 0  # px, of the part of the images that was looked at
     phantom: str = CROSSED_WIRES  # its kind
     known: Any = None  # of the phantom, by its kind's `read`
+    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # (n, 4, 4) NaN where there is none
 
     @property
     def usable(self) -> NDArray[np.int64]:
@@ -156,7 +157,7 @@ def at_poses(
     covariance, rates = (None if each is None else each[usable] for each in (pose_covariance, pose_rates))
     kind = registry.kind(PHANTOMS, frames.phantom)
     sightings = kind.sight([seen[k] for k in usable], poses[usable], covariance, rates, lag_sigma_s)
-    return replace(frames, sightings=sightings, seen=seen)
+    return replace(frames, sightings=sightings, seen=seen, poses=poses)
 
 
 def some(frames: PhantomFrames, chosen: NDArray[np.intp]) -> PhantomFrames:
@@ -167,7 +168,7 @@ def some(frames: PhantomFrames, chosen: NDArray[np.intp]) -> PhantomFrames:
 def of_pairs(name: str, size: Size, poses: Array, pixels: Array) -> PhantomFrames:
     """Frames of n pairs of a pose and the crossing's pixel, found elsewhere."""
     crossings = tuple(Crossing(pixel, np.full((2, 2), np.nan), np.nan) for pixel in pixels)
-    return PhantomFrames(name, size, Sightings(poses, pixels), np.arange(len(pixels)), crossings)
+    return PhantomFrames(name, size, Sightings(poses, pixels), np.arange(len(pixels)), crossings, poses=poses)
 
 
 def rejected(frames: PhantomFrames) -> dict[str, list[int]]:

@@ -241,7 +241,7 @@ def calibrate(
     counted = inliers if inliers.any() else ~inliers
     rms = float(np.sqrt((_residuals(estimate, sightings.of(counted)) ** 2).sum(axis=1).mean()))
     if factor > MAX_FACTOR or rms > MAX_RMS_MM or inliers.mean() < MIN_INLIERS:
-        _say_why(sightings, noise, rms, factor, inliers, _farthest(estimate, sightings, numbers))
+        _refuse(rms, factor, inliers, _farthest(estimate, sightings, numbers))
     slopes, left = _whitened(estimate, sightings, noise)
     used = UNKNOWNS["wire"].stop if sightings.beside is None else len(UNKNOWNS)
     equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
@@ -275,10 +275,15 @@ def calibrate(
 
 
 def misfit(sightings: Sightings, noise: Noise) -> float:
-    """Mean square distance, mm^2, of the point from one place, of which each counts up to MAX_RMS_MM; infinite for few frames."""
+    """Mean square distance, mm^2, of the point from one place, of which each counts up to MAX_RMS_MM; infinite for few frames.
+
+    All count so by scales that no scanner has: poses that hardly move fit an image that is a point.
+    """
     if len(sightings.pixels) < MIN_FRAMES:
         return np.inf
     start = _robust_start(sightings, noise, np.random.default_rng(0), None, DRAWS_TRIED, refined=1)
+    if not probe_checks.plausible(start.scale):
+        return MAX_RMS_MM**2
     return float(np.minimum((_residuals(start, sightings) ** 2).sum(axis=1), MAX_RMS_MM**2).mean())
 
 
@@ -619,17 +624,8 @@ def _farthest(estimate: _Estimate, sightings: Sightings, numbers: NDArray[np.int
     return "farthest off: " + ", ".join(f"frame {names[k]} by {away[k]:.2g} mm" for k in np.argsort(-away)[:NAMED])
 
 
-def _say_why(sightings: Sightings, noise: Noise, rms: float, factor: float, inliers: Mask, farthest: str) -> None:
-    """Refuse frames that don't show one point at rest, and name the reading of the poses under which they would."""
-    distances = {}
-    for meaning, poses in probe_checks.readings(sightings.poses).items():
-        other = Sightings(poses, sightings.pixels)
-        start = _robust_start(other, noise, np.random.default_rng(0))
-        if np.median(_squared(start, other, noise)) < MAX_FACTOR**2 * MEDIAN:
-            distances[meaning] = np.median(np.linalg.norm(_residuals(start, other), axis=1))
-    likely = min(distances, key=lambda meaning: distances[meaning], default="")
-    if likely and distances[likely] < min(rms / 2, MAX_RMS_MM):
-        raise InputError(f"poses: expected world_from_target, found {likely}: read so, the crossing is at rest")
+def _refuse(rms: float, factor: float, inliers: Mask, farthest: str) -> None:
+    """Refuse frames that don't show one point at rest."""
     few = f"only {inliers.sum()} of {len(inliers)} that agree"
     found = few if inliers.mean() < MIN_INLIERS else f"residuals of {rms:.1f} mm (rms), {factor:.1f} times the assumed noise"
     raise InputError(f"sightings: expected frames of one point at rest, found {found}; {farthest}")

@@ -26,6 +26,7 @@ FAR_DEG, FAR_MM = 45.0, 60.0  # from the design of the bracket; beyond, it is an
 ALIKE_DEG, ALIKE_MM = 30.0, 30.0  # from the design but for axes or units: another bracket is hardly so by chance
 DEPTHS = (10.0, 400.0)  # mm, of ordinary images
 UNITS = {"cm": 10.0, "inches": 25.4}  # mm; metres and micrometres leave SCALES
+POSE_UNITS = {"m": 1e3, **UNITS}  # mm
 AXES = ("c0-c1", "c0-c2", "normal")  # of the target
 
 
@@ -170,6 +171,11 @@ def _motions(frames: _Frames, size: Size) -> dict[str, float]:
     }
 
 
+def plausible(scale: Array) -> bool:
+    """Whether scales : (2,) mm/px are a scanner's."""
+    return bool(((scale >= SCALES[0]) & (scale <= SCALES[1])).all())
+
+
 def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -> None:
     """Refuse scales of other units, and a probe that is as designed but for swapped axes or other units."""
     for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
@@ -214,7 +220,7 @@ def doubts(calibration: ProbeCalibration, size: Size, expected: Array) -> Iterat
         yield f"the image is {deep:.3g} mm deep: are the poses in mm?"
     if _near(calibration, size, expected):
         return
-    angle, away = _off(calibration, size, expected)
+    angle, away = off_design(calibration, size, expected)
     yield (
         f"the probe is {angle:.0f} deg and {away:.0f} mm from its design: another bracket? Then nothing excludes swapped axes of "
         "the image, which fit as well; a pose that is right can be given as its design"
@@ -247,6 +253,12 @@ def readings(world_from_target: Array) -> dict[str, Array]:
     transposed = world_from_target.copy()
     transposed[:, :3, :3] = np.swapaxes(world_from_target[:, :3, :3], 1, 2)
     result = {"target_from_world, the inverse": inverse, "transposed rotations": transposed}
+    turns = Rotation.from_matrix(world_from_target[:, :3, :3]).as_quat()  # x, y, z, w
+    for order, name in (((1, 2, 3, 0), "that begins with w, read as one that ends with it"),
+                        ((3, 0, 1, 2), "that ends with w, read as one that begins with it")):  # fmt: skip
+        turned = world_from_target.copy()
+        turned[:, :3, :3] = Rotation.from_quat(turns[:, order]).as_matrix()
+        result[f"a quaternion {name}"] = turned
     for order, name in (((1, 0, 2), "x and y"), ((0, 2, 1), "y and z"), ((2, 1, 0), "x and z")):
         swapped = world_from_target.copy()
         swapped[:, :3, 3] = swapped[:, order, 3]
@@ -279,29 +291,29 @@ def _centre(calibration: ProbeCalibration, size: Size) -> Array:
     return calibration.to_target((np.array(size) - 1) / 2)
 
 
-def _off(calibration: ProbeCalibration, size: Size, expected: Array) -> tuple[float, float]:
+def off_design(calibration: ProbeCalibration, size: Size, expected: Array) -> tuple[float, float]:
     """Angle, deg, and distance of the image's centre, mm, from the design : (4, 4), with the scales as found."""
     away = _centre(calibration, size) - _centre(ProbeCalibration(expected, calibration.scale), size)
     return _angle(expected[:3, :3].T @ calibration.target_from_image[:3, :3]), float(np.linalg.norm(away))
 
 
 def _near(calibration: ProbeCalibration, size: Size, expected: Array) -> bool:
-    angle, away = _off(calibration, size, expected)
+    angle, away = off_design(calibration, size, expected)
     return angle < FAR_DEG and away < FAR_MM
 
 
 def _off_if_confused(calibration: ProbeCalibration, size: Size, expected: Array) -> dict[str, tuple[float, float]]:
     """Angle, deg, and distance, mm, from the design, by what may be confused: the image's axes, the target's, units."""
-    turn, (_, away) = calibration.target_from_image[:3, :3], _off(calibration, size, expected)
+    turn, (_, away) = calibration.target_from_image[:3, :3], off_design(calibration, size, expected)
     off = {name: (_angle((expected[:3, :3] @ axes).T @ turn), away) for name, axes in IMAGE_AXES.items()}
     for signed in _TURNED:
         axes = ", ".join(" -"[int(row.sum() < 0)].strip() + "xyz"[int(np.argmax(np.abs(row)))] for row in signed)
-        off[f"the target's axes are swapped: ({axes}) of the design"] = _off(
+        off[f"the target's axes are swapped: ({axes}) of the design"] = off_design(
             calibration, size, rigid.transform(signed, np.zeros(3)) @ expected
         )
     for unit, length in UNITS.items():
         pose = rigid.transform(turn, calibration.target_from_image[:3, 3] * length)
-        off[f"the poses are in {unit}"] = _off(ProbeCalibration(pose, calibration.scale * length), size, expected)
+        off[f"the poses are in {unit}"] = off_design(ProbeCalibration(pose, calibration.scale * length), size, expected)
     return off
 
 

@@ -18,7 +18,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
-EDGE = 3  # frames, too few to find a sudden movement by
+EDGE = 3  # frames at an end, of which it is said that all are outliers
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
 NOISY = 3.0  # times the assumed noise, beyond which something else than noise is likely, though few frames don't show what
@@ -115,10 +115,10 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
         yield f"warning     {doubt}"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
-    for which, end, there in (("last", slice(-EDGE, None), "before"), ("first", slice(EDGE), "after")):
-        if found.outliers[end].all():
+    for which, outliers, there in (("last", found.outliers[::-1], "before"), ("first", found.outliers, "after")):
+        if (count := int(outliers.argmin())) >= EDGE:
             slipped = f"if the bracket slipped {there} them, the result is of {there}"
-            yield f"warning     the {which} {EDGE} frames are outliers: {slipped}"
+            yield f"warning     the {which} {count} frames are outliers: {slipped}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
     yield from _describe_sound(figures, settings)
 

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, PlainValidator, field_validator, model_validator
 
 from recon import registry
 from recon.errors import InputError
 from recon.model.probe import SPEEDS, ProbeCalibration, Speed, SpeedSigma
 from recon.model.rig import Finite, NotNegative, Part, Probe
-from recon.probe_calibration import probe_checks, sound_in_water, wires
+from recon.probe_calibration import misreadings, probe_checks, sound_in_water, wires
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.phantom_frames import CROSSED_WIRES, PHANTOMS, STYLUS, Adjusted, PhantomFrames
 from recon.probe_calibration.point_calibration import Noise
@@ -203,7 +204,7 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
     expected = design.target_from_image.matrix()
     face_row = frames.first_row if settings.face_row is None else settings.face_row
     try:
-        found = registry.kind(PHANTOMS, frames.phantom).calibrate(frames, settings, expected)
+        found = _calibrate(frames, settings, expected)
         found = replace(found, calibration=replace(found.calibration, face_row=float(face_row)))
         shown_sy = _design_sy(found.calibration, frames.size, design) if scanner_sy is None else scanner_sy
         implied = sound_in_water.implied_speed(found.calibration, shown_sy, settings.assumed_speed)
@@ -218,6 +219,19 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
     ratio_sigma = wanted / in_water**2 * settings.water_speed_sigma
     converted = sound_in_water.in_medium(found.calibration, in_water, wanted, ratio_sigma=ratio_sigma)
     return Result(found, converted, shown_sy, implied)
+
+
+def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.float64]) -> Adjusted:
+    """As the phantom's `calibrate`, or the likely mistake in what it refuses."""
+    kind = registry.kind(PHANTOMS, frames.phantom)
+    try:
+        return kind.calibrate(frames, settings, expected)
+    except InputError as error:
+        agree = str(error).startswith("calibration:")  # as those of a mirrored image do, whose probe is far from its design
+        mistake = misreadings.explain(frames, kind, settings, expected, agree) if hasattr(kind, "misfit") else None
+        if mistake is None:
+            raise
+        raise InputError(f"{error}; likely {mistake}") from None
 
 
 def _design_sy(found: ProbeCalibration, size: tuple[int, int], design: Probe) -> float:

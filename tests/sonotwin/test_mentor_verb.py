@@ -129,7 +129,9 @@ def test_light_follows_the_patient_from_the_reference(given, rig, patient, tmp_p
     steps = films.places(4)[:, :3, 3] - at[0, :3, 3]
     met = (skin_shapes.PLANE_MM + steps[:, 2:]) * ray / ray[2]
     off = np.linalg.norm(np.array(entry["points"][0]) - (met - steps), axis=1)
-    assert off.min() < 0.1, "where the moved skin was met, moved back by where the patient had gone at one of the film's four moments"
+    assert off.min() < 0.1, (
+        "where the moved skin was met, moved back by where the patient had gone at one of the film's four moments"
+    )
     assert not shown[-1].any(), "dark at the end"
 
 

@@ -11,6 +11,8 @@ A module has
 - `calibrate(frames, settings, expected)`: a `phantom_frames.Adjusted`, by `phantom_frames.PhantomFrames`;
 - `misfit(frames, settings)`, where it serves to find the B-scans' lag: mean square distance, mm^2, from where the phantom is
   likeliest, large ones cut, by a quick robust start; the adjustment of such a phantom has `late`, a `lateness.Lateness`;
+- `others(known)`, where it may be defined wrongly: other definitions of the same kind, in words and as of `read`, which are tried
+  where frames are refused;
 - `figures(found)` and `describe(found, settings)` of that one: `Metrics`, and lines, besides those of all phantoms.
 
 A phantom that shows one point has but `find` of its own, the rest is in `recon.probe_calibration.point_phantom`;

@@ -19,7 +19,7 @@ from recon.probe_calibration.wire_dots import Dots
 
 Array = NDArray[np.float64]
 
-__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "misfit", "read", "sight"]
+__all__ = ["MIN_FRAMES", "SHOWS", "WAYS", "calibrate", "describe", "figures", "find", "misfit", "others", "read", "sight"]
 SHOWS = "dots of all wires"
 WAYS = {
     "no echo stands out": "another scanner? give appearance.min_contrast_db",
@@ -65,6 +65,14 @@ def _wires(known: PlusPhantom, settings: Settings) -> Wires:
 def misfit(frames: PhantomFrames, settings: Settings) -> float:
     """Mean square distance of the dots from their wires, as `line_calibration.misfit`."""
     return line_calibration.misfit(frames.sightings, _wires(frames.known, settings), settings.noise)
+
+
+def others(known: PlusPhantom) -> Iterator[tuple[str, PlusPhantom]]:
+    """The same wires strung or defined otherwise, in words."""
+    rows = range(len(known.wires.ends))
+    several = [(f"the diagonal of N-wire {row + 1}", [row]) for row in rows]
+    for which, restrung in [*several, ("all diagonals, as of a left-handed frame", [*rows])]:
+        yield f"front and back exchanged of {which}", replace(known, wires=known.wires.restrung(restrung))
 
 
 def calibrate(frames: PhantomFrames, settings: Settings, expected: Array) -> LineAdjustment:

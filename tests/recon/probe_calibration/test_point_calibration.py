@@ -266,12 +266,6 @@ SWAPPED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 DOWN = np.diag([1.0, 1, -1, 1])
 
 
-def transposed(poses):
-    result = poses.copy()
-    result[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    return result
-
-
 def shifts(poses, matrix):
     result = poses.copy()
     result[:, :3, 3] = poses[:, :3, 3] @ matrix[:3, :3]
@@ -283,10 +277,6 @@ def shifts(poses, matrix):
     [
         (lambda poses: poses @ SWAPPED, "left-handed"),
         (lambda poses: SWAPPED @ poses, "left-handed"),
-        (np.linalg.inv, "target_from_world"),
-        (transposed, "transposed rotations"),
-        (lambda poses: shifts(poses, SWAPPED), "axes x and y swapped in the translations"),
-        (lambda poses: shifts(poses, DOWN), "wrong handedness, z mirrored"),
         (lambda poses: poses @ np.diag([1, 1, 1, 2.0]), "rigid transform"),
         (lambda poses: poses * np.nan, "not finite"),
         (lambda poses: shifts(poses, np.eye(4) / 1000), "are the poses in mm"),

@@ -1,0 +1,134 @@
+"""Is the mistake behind frames that contradict each other named, by crossed wires and by N-wires alike?"""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.probe_calibration import phantom_frames, plus_phantom, tank_calibration
+from recon.probe_calibration.phantom_frames import PhantomFrames
+from recon.probe_calibration.wire_dots import Dots
+from tests.recon import bscans, probe_motions, wire_rows
+
+
+def crossing(rig, rng):
+    sightings = probe_motions.observe(probe_motions.true_probe(rig), *probe_motions.motion(rig), rng)
+    order = rng.permutation(len(sightings.poses))  # what its motion repeats reversed is another's mistake
+    return phantom_frames.of_pairs("drawn", bscans.SIZE, sightings.poses[order], sightings.pixels[order])
+
+
+def rows(rig, rng):
+    probe = probe_motions.true_probe(rig)
+    seen = wire_rows.observe(probe, wire_rows.FCAL, wire_rows.poses_over(probe, wire_rows.FCAL, bscans.SIZE, rng), rng)
+    dots = tuple(Dots(*both, 20.0) for both in zip(seen.pixels, seen.pixel_covariance, strict=True))
+    numbers, known = np.arange(len(dots)), plus_phantom.FCAL
+    return PhantomFrames("drawn", bscans.SIZE, seen, numbers, dots, phantom="n_wires", known=known, poses=seen.poses)
+
+
+@pytest.fixture(params=[crossing, rows])
+def frames(request, rig, rng):
+    return request.param(rig, rng)
+
+
+def at(frames, poses):
+    """The same frames with poses that are told otherwise."""
+    return replace(frames, sightings=replace(frames.sightings, poses=poses), poses=poses)
+
+
+def calibrate(rig, frames, **more):
+    return tank_calibration.calibrate(
+        frames, rig.probe, tank_calibration.Settings(phantom=frames.phantom, temperature_c=22, **more)
+    )
+
+
+def refusal(rig, frames):
+    with pytest.raises(InputError) as raised:
+        calibrate(rig, frames)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+def turned_by(poses, change):
+    """Poses with a change of their rotations."""
+    result = poses.copy()
+    result[:, :3, :3] = change(Rotation.from_matrix(poses[:, :3, :3])).as_matrix()
+    return result
+
+
+def shifted_by(poses, change):
+    """Poses with a change of their translations."""
+    result = poses.copy()
+    result[:, :3, 3] = change(poses[:, :3, 3])
+    return result
+
+
+def _as_radians(turn):
+    return Rotation.from_rotvec(turn.as_rotvec(degrees=True))
+
+
+READ = {
+    "poses in m:": lambda poses: shifted_by(poses, lambda places: places / 1000),
+    "poses in inches:": lambda poses: shifted_by(poses, lambda places: places / 25.4),
+    "poses of target_from_world, the inverse:": np.linalg.inv,
+    "poses of transposed rotations:": lambda poses: turned_by(poses, lambda turn: turn.inv()),
+    "poses of a quaternion that begins with w": lambda poses: turned_by(
+        poses, lambda turn: Rotation.from_quat(turn.as_quat()[:, [3, 0, 1, 2]])
+    ),
+    "poses of a quaternion that ends with w": lambda poses: turned_by(
+        poses, lambda turn: Rotation.from_quat(turn.as_quat()[:, [1, 2, 3, 0]])
+    ),
+    "poses of axes y and z swapped": lambda poses: shifted_by(poses, lambda places: places[:, [0, 2, 1]]),
+    "poses of translations of the wrong handedness, x": lambda poses: shifted_by(poses, lambda places: places * [-1, 1, 1]),
+    "poses in reversed order:": lambda poses: poses[::-1],
+    "B-scans late by 2 of the poses:": lambda poses: np.concatenate([poses[2:], poses[:2]]),
+    "B-scans early by 1 of the poses:": lambda poses: np.roll(poses, 1, axis=0),
+    "degrees read as radians": lambda poses: turned_by(poses, _as_radians),
+}
+
+
+@pytest.mark.parametrize("named", READ)
+def test_poses_that_mean_something_else_are_named(named, rig, frames):
+    assert calibrate(rig, frames)
+    assert named in refusal(rig, at(frames, READ[named](frames.poses))).partition("; likely ")[2]
+
+
+@pytest.mark.parametrize("first", [10, 19])
+@pytest.mark.parametrize("pushed", [False, True])
+def test_the_frame_before_which_something_moved_is_named(first, pushed, rig, frames):
+    """By 15 mm and 8 degrees, of which robust fits leave the fewer frames out, so most are refused only if told to the point."""
+    step = rigid.from_rotation_vector(np.radians([5.0, -4.0, 5.0]), [9.0, -8.0, 9.0])
+    poses = frames.poses.copy()
+    about = rigid.transform(np.eye(3), poses[:, :3, 3].mean(axis=0))
+    poses[first:] = about @ step @ rigid.invert(about) @ poses[first:] if pushed else poses[first:] @ step
+    try:
+        found = calibrate(rig, at(frames, poses)).adjustment
+    except InputError as error:
+        assert abs(int(re.search(r"was pushed, before frame (\d+)", str(error))[1]) - first) <= 1
+    else:
+        assert found.moved is not None or found.outliers[first:].all() or found.outliers[:first].all()
+
+
+def test_frames_at_no_rest_by_any_reading_are_of_something_that_moves(rig, frames, rng):
+    hand = [rigid.from_rotation_vector(*step) for step in rng.standard_normal((len(frames.poses), 2, 3)) * [[0.1], [20.0]]]
+    assert "likely poses in the frame of another body, or of something that moves" in refusal(
+        rig, at(frames, hand @ frames.poses)
+    )
+
+
+def test_diagonals_that_run_the_other_way_are_named(rig, rng):
+    """No single image shows it."""
+    frames = rows(rig, rng)
+    other = replace(frames, known=replace(frames.known, wires=frames.known.wires.restrung([0, 1, 2])))
+    assert "likely front and back exchanged of all diagonals, as of a left-handed frame: read so" in refusal(rig, other)
+
+
+def test_an_image_that_is_mirrored_is_no_other_reading_of_poses(rig, rng):
+    """It fits as well as the truth, and only the design tells."""
+    frames = crossing(rig, rng)
+    pixels = frames.sightings.pixels * [-1, 1] + [bscans.SIZE[0] - 1, 0]
+    said = refusal(rig, replace(frames, sightings=replace(frames.sightings, pixels=pixels)))
+    assert "mirrored left to right" in said and "likely" not in said
