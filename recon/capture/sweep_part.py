@@ -87,21 +87,12 @@ class SweepCapture:
         return f"{spans}, {apart}: between two of them that are more than {tracks.MAX_GAP_S:g} s apart the probe may be anywhere"
 
     def pose_covariance(self, lag_s: float = 0.0) -> Array | None:
-        """Covariance : (n, 6, 6) of these poses, as in `recon.model.tracks`; NaN where there is none. None if the track has none.
-
-        A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
-        """
-        covariance = self.track.covariance
-        if covariance is None or self.track.found.sum() < 2:
-            return None
-        return np.einsum("nm,mij->nij", self.pose_shares(lag_s) ** 2, covariance[self.track.found])
+        """Covariance : (n, 6, 6) of these poses; see `recon.model.tracks.covariance_at`."""
+        return tracks.covariance_at(self.track, self.times, lag_s)
 
     def shared_covariance(self, lag_s: float = 0.0) -> Array | None:
-        """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN where there is none. None if the track has none."""
-        shared = self.track.shared
-        if shared is None or self.track.found.sum() < 2:
-            return None
-        return np.einsum("nm,mij->nij", self.pose_shares(lag_s), shared[self.track.found])
+        """Covariance : (n, 6, 6) of what errs alike in all these poses; see `recon.model.tracks.shared_at`."""
+        return tracks.shared_at(self.track, self.times, lag_s)
 
     def pose_shares(self, lag_s: float = 0.0) -> Array:
         """Weights : (n, m) of the m poses that were found in those of the n B-scans; see `recon.model.tracks.shares_at`."""

@@ -139,13 +139,7 @@ def from_body(track: Track, body: Track) -> Track:
     Tolerances that both share, as those of the cameras, count twice, so that the shared part is no less than it is.
     """
     if not np.array_equal(track.times, body.times):
-        numbers, shares = neighbours_at(body, track.times, 0.0)
-        shares = np.nan_to_num(shares)
-        own, alike = (
-            None if each is None else np.einsum("nk,nkij->nij", weights, each[numbers])
-            for each, weights in ((body.covariance, shares**2), (body.shared, shares))
-        )
-        body = Track(track.times, at(body, track.times), own, alike)
+        body = Track(track.times, at(body, track.times), covariance_at(body, track.times), shared_at(body, track.times))
     still = Track(np.zeros(1, np.int64), np.eye(4)[None], np.zeros((1, 6, 6)))
     return relative(track, body, still)
 
@@ -184,6 +178,23 @@ def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
     np.add.at(shares, (np.arange(len(weights))[:, None], numbers), weights)
     shares[np.isnan(weights).any(axis=1)] = np.nan
     return shares[:, track.found]
+
+
+def covariance_at(track: Track, times: NDArray[np.int64], lag_s: float = 0.0) -> Array | None:
+    """Covariance : (n, 6, 6) of the poses of `poses_at`; NaN where there is none. None if the track has none.
+
+    A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
+    """
+    return None if track.covariance is None else _blended(track.covariance, *neighbours_at(track, times, lag_s), power=2)
+
+
+def shared_at(track: Track, times: NDArray[np.int64], lag_s: float = 0.0) -> Array | None:
+    """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN where there is none. None if the track has none."""
+    return None if track.shared is None else _blended(track.shared, *neighbours_at(track, times, lag_s), power=1)
+
+
+def _blended(covariance: Array, numbers: NDArray[np.intp], shares: Array, power: int) -> Array:
+    return np.einsum("nk,nkij->nij", shares**power, covariance[numbers])
 
 
 def poses_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:

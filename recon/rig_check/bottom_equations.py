@@ -168,10 +168,9 @@ def _noise(placed: _Placed, lines: Lines, track: Track, known: Known, bottom: Bo
     used, probe, normal = bottom.used, known.probe, bottom.normal
     arms = np.einsum("nij,nkj->nki", placed.poses[used][:, :3, :3], probe.to_target(lines.pixels[used]))
     by_pose = np.einsum("k,njkl->njl", normal, rigid.slopes(arms))
-    own = np.broadcast_to(ASSUMED, (used.sum(), 6, 6))
-    if track.covariance is not None:
-        shares = tracks.shares_at(track, lines.times[used], bottom.lag_s)
-        own = np.einsum("nm,mij->nij", shares**2, track.covariance[track.found])
+    own = tracks.covariance_at(track, lines.times[used], bottom.lag_s)
+    if own is None:
+        own = np.broadcast_to(ASSUMED, (used.sum(), 6, 6))
     by_row = probe.scale[1] * (placed.poses[used][:, :3, :3] @ probe.target_from_image[:3, 1]) @ normal
     return propagate(by_pose, own) + (DEPTH_PX * by_row)[:, None, None] ** 2 * np.eye(2)
 

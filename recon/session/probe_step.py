@@ -229,7 +229,7 @@ def at_lag(frames: PhantomFrames, sweep: Sweep, lag_s: float, lag_sigma_s: float
     poses, moving = tracks.poses_at(sweep.track, sweep.times, lag_s), rates(sweep, lag_s)
     covariance = sweep.pose_covariance(lag_s)
     if covariance is None:  # between two poses half as much
-        shares = np.nan_to_num(tracks.shares_at(sweep.track, sweep.times, lag_s), nan=1.0)
+        shares = np.nan_to_num(tracks.neighbours_at(sweep.track, sweep.times, lag_s)[1], nan=1.0)
         own = noise.from_body(poses) if frames.phantom == STYLUS else noise.of_pose
         covariance = (shares**2).sum(axis=1)[:, None, None] * own
     turns = moving[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2)
