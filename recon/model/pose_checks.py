@@ -57,10 +57,10 @@ class MotionLimits:
     near_mm: float = 150.0  # the same of its farthest place from the origin
     slow_mm_s: float = 6.0  # and of its median speed
     swing: float = 2.5  # way of the places over that of the inverses'; of right sweeps 1.03 at most, of far trackers 0.15
-    no_order: float = 1.5  # mean square step over the variance of the places; 2 of a shuffled table, far below 1 of a motion
+    no_order: float = 0.7  # median step over that in random order; 1 of a shuffled table, far less of a motion
     least_covered: float = 0.8  # share of the images with a pose, below which it is said
     most_share: float = 1 / 3  # of poses that may be left out
-    most_share_in_no_order: float = 0.1  # the same where the others are in no order either
+    most_jumps_in_no_order: float = 0.1  # of jumps, where the others are in no order either
 
 
 LIMITS = MotionLimits()
@@ -129,12 +129,12 @@ def without_implausible(
         for line in found.lines(what):
             log.warning("%s: taken all the same: %s", place, line)
         return poses, Findings(found.count)
-    shuffled = "jump" in found.rows and in_no_order(poses)
-    most = LIMITS.most_share_in_no_order if shuffled else LIMITS.most_share
-    if len(found.rows_left_out) > most * found.count:
+    shuffled = len(found.rows.get("jump", ())) > LIMITS.most_jumps_in_no_order * found.count and in_no_order(poses)
+    if shuffled or len(found.rows_left_out) > LIMITS.most_share * found.count:
         if "jump" in found.rows and (fault := unit_fault(poses, unit)):
             raise InputError(f"{place}: poses: expected a sweep in mm, found {fault}; {WAY}")
-        expected = f"a motion that a hand makes, but for {100 * most:.0f} % at most"
+        share = LIMITS.most_jumps_in_no_order if shuffled else LIMITS.most_share
+        expected = f"a motion that a hand makes, but for {100 * share:.0f} % at most"
         order = ", and each as far from the next as from any: rows out of order?" if shuffled else ""
         raise InputError(f"{place}: poses: expected {expected}, found {'; '.join(found.lines(what))}{order}; {WAY}")
     for line in found.lines(what):
@@ -189,12 +189,13 @@ def in_no_order(poses: Array) -> bool:
     """Whether places : (n, 4, 4), NaN where there is none, lie as far from the next as from any, as in a table that was shuffled.
 
     Poses at rest, each at another place, do so by right.
-    Source: von Neumann 1941, the ratio of the mean square successive difference to the variance: 2 of independent numbers.
     """
     places = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
     if len(places) < LIMITS.alone:
         return False
-    return float((np.diff(places, axis=0) ** 2).sum(axis=1).mean()) > LIMITS.no_order * float(places.var(axis=0).sum())
+    orders = np.arange(len(places)), np.random.default_rng(0).permutation(len(places))
+    step, apart = (float(np.median(np.linalg.norm(np.diff(places[order], axis=0), axis=1))) for order in orders)
+    return step > LIMITS.no_order * apart
 
 
 def unit_fault(poses: Array, unit: str = "") -> str | None:

@@ -221,6 +221,20 @@ def test_what_is_left_out_is_counted_and_beyond_a_share_refused(rng, caplog):
         judged(poses)
 
 
+@pytest.mark.parametrize("rests", [1, 20])
+def test_a_table_that_was_shuffled_is_refused_as_such(rests, rng):
+    """Of a hand that moves, and of one that rests in each place: fewer than a third of the rows may jump by more than it does."""
+    poses = np.repeat(sweep(rng, 100.0, 5.0, count=400 // rests), rests, axis=0)
+    assert not pose_checks.in_no_order(poses)
+    shuffled = rng.permutation(poses)
+    assert pose_checks.in_no_order(shuffled)
+    with pytest.raises(
+        InputError, match=r"farther off its neighbours .*, and each as far from the next as from any: rows out of"
+    ):
+        judged(shuffled, np.arange(400) / RATE_HZ)
+    judged(poses, np.arange(400) / RATE_HZ)
+
+
 def test_stills_have_the_pose_of_their_moment(rng):
     """One pose a second; a still a second with the same time, up to its rounding to ms, and one between."""
     poses = sweep(rng, rate_hz=1.0, count=5)
