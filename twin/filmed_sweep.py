@@ -178,7 +178,14 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
         settings.conditions.motion,
     )
     bodies = swept_bodies.lead(
-        settings, settings.rig, settings.ultrasound, plan, settings.pose_noise, settings.own_seed, settings.conditions.motion
+        settings,
+        settings.rig,
+        settings.ultrasound,
+        plan,
+        settings.pose_noise,
+        settings.own_seed,
+        settings.conditions.motion,
+        settings.filmed,
     )
     moved = settings.moved.matrix(scene)
     plan = replace(plan, track=_carried(plan.track, moved))

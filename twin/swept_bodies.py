@@ -16,7 +16,7 @@ from twin import conditions
 from twin.tracking.film_path import STILL, Way
 from twin.tracking.film_paths import insertion
 from twin.tracking.led_bodies import LedBodies
-from twin.tracking.views_of_target import cameras_of, in_views
+from twin.tracking.views_of_target import cameras_of, covers, in_views
 from twin.ultrasound import scan_lines
 from twin.ultrasound.timed_sweep import Plan, PoseNoise, noisy
 from twin.ultrasound.transducer import Transducer
@@ -24,6 +24,7 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 
 SLICE_MM = 1.5  # of the B-scan to each side, in which a tip is seen; assumed, about a linear array's at its focus
+POSES_LOOKED_AT = 5  # of the other bodies, evenly over the sweep, of which an insertion covers none
 STREAM = 16  # of random numbers, apart from those of the probe's poses
 
 
@@ -47,6 +48,11 @@ class SweptBody:
         """Whether both cameras have its target in view : (m,), as of `in_views`."""
         return in_views(self.truth.poses, self.target, cameras_of(rig))
 
+    def covers(self, target: Target, poses: Array, rig: Rig) -> NDArray[np.bool_]:
+        """Whether its target and another one at poses : (m, 4, 4) lie before each other for a camera : (m,), as of `covers`."""
+        pairs = zip(self.truth.poses, poses, strict=True)
+        return np.array([covers(own, self.target, other, target, cameras_of(rig)) for own, other in pairs])
+
     def in_slice(self, world_from_image: Array, rig: Rig) -> NDArray[np.bool_] | None:
         """Whether its tip lies in the B-scans : (n,) of poses (n, 4, 4), within their slice; None of a body without a tip."""
         tip = self.look.tip_mm(self.target)
@@ -66,9 +72,12 @@ def lead(
     noise: PoseNoise,
     seed: int,
     errors: conditions.Motion = STILL,
+    filmed: bool = False,
 ) -> Mapping[str, SweptBody]:
     """Lead the rig's further bodies beside the probe, each by its name; if no path is given, needles to the B-scan, while what
     stands stays where it is.
+
+    filmed : whether cameras film them, so that none should hide another one's target
 
     Raises
     ------
@@ -77,16 +86,20 @@ def lead(
     """
     standing = led.standing(rig)
     face, bodies = mean_pose(scan_lines.world_from_face(transducer, plan.truth.poses) @ _middle(transducer)), {}
-    for number, (name, target) in enumerate(rig.bodies.items(), 1):
-        look, given = led.look(name), led.bodies.get(name)
+    some = np.unique(np.linspace(0, len(plan.target.times) - 1, POSES_LOOKED_AT).astype(int))
+    others = [(rig.target, plan.target.poses()[some])]
+    numbered = sorted(enumerate(rig.bodies, 1), key=lambda each: led.look(each[1]).IN_A_HAND)  # what stands comes first
+    for number, name in numbered:
+        look, given, target = led.look(name), led.bodies.get(name), rig.bodies[name]
         to_image = look.line_mm(target) is not None and (given is None or given.path is None)
         path = insertion.Kind() if to_image else standing.get(name) or led.path_of(name, number - 1)
-        way = led.lead(name, path, rig, face, seed, errors)
+        way = led.lead(name, path, rig, face, seed, errors, others if filmed else ())
         truth, scanned = (_along(way, moments) for moments in (plan.target.times, plan.truth.times))
         seen = noisy(truth.poses, noise, np.random.default_rng([seed, STREAM, number]))
         seen[~in_views(truth.poses, target, cameras_of(rig))] = np.nan
         bodies[name] = SweptBody(look, target, way, Track(plan.track.times, seen), truth, scanned)
-    return bodies
+        others.append((target, truth.poses[some]))
+    return {name: bodies[name] for name in rig.bodies}
 
 
 def mean_pose(poses: Array) -> Array:

@@ -35,6 +35,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SCANNER, sweep_part
+from recon.model.rig import PROBE
 from sonotwin.console_watch import ConsoleWatch, LineConsole
 from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
@@ -119,14 +120,18 @@ def shown(planned: PlannedSweep, console: Console) -> Iterator[Scan]:
 
 def places(planned: PlannedSweep) -> Iterator[tuple[str, bool]]:
     """A line for each further body, where cameras and scanner see it, and whether each of them does at all."""
+    rig, filmed = planned.settings.rig, planned.settings.filmed
+    before = [(PROBE, rig.target, planned.world_from_reference @ planned.plan.target.poses())]
     for name, body in planned.bodies.items():
-        rig = planned.settings.rig
         viewed, tip = body.in_view(rig), body.in_slice(planned.plan.truth.poses, rig)
         line = f"{name:<11} target in view of both cameras at {viewed.sum()} of {len(viewed)} poses"
         if tip is not None:
             line += f"; tip in the slice in {tip.sum()} of {len(tip)} B-scans"
-        seen = bool(viewed.any() and (tip is None or tip.any()))
+        covered = {other: int(body.covers(target, poses, rig).sum()) for other, target, poses in before if filmed}
+        line += "".join(f"; one of it and the {other} may hide the other at {count}" for other, count in covered.items() if count)
+        seen = bool(viewed.any() and (tip is None or tip.any()) and max(covered.values(), default=0) < len(viewed))
         yield line if seen else f"{line}; change bodies.{name}.path, or the probe's path", seen
+        before.append((name, body.target, body.truth.poses))
 
 
 def led_along(path: AnyPath) -> str:

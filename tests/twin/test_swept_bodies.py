@@ -136,7 +136,7 @@ def test_the_needle_is_seen_in_the_b_scans_at_its_tip(tmp_path):
 
 def test_a_patient_who_moved_carries_scene_probe_and_bodies(tmp_path):
     """The scanner sees the same, the cameras see all moved by one step about the phantom's middle."""
-    still, moved = planned(), planned("filmed=true", "moved={turn_deg: [0, 3, 4], shift_mm: [12, -16, 0]}")
+    still, moved = planned("filmed=true"), planned("filmed=true", "moved={turn_deg: [0, 3, 4], shift_mm: [12, -16, 0]}")
     step, middle = moved.world_from_reference, still.scene.things[0].mesh.bounds.mean(axis=0)
     np.testing.assert_array_equal(still.world_from_reference, np.eye(4))
     np.testing.assert_allclose(rigid.apply(step, middle) - middle, [12, -16, 0], atol=1e-9)

@@ -62,6 +62,7 @@ class Aimed(NamedTuple):
     line_mm: Array | None  # (2, 3) from the shaft's rear end to the tip, in the target's frame; None of a body without a tip
     world_from_face: Array  # (4, 4) mm: the middle of the array's face, x along it, y into the depth
     cameras: Sequence[Camera] = ()  # that are to see the target
+    others: Sequence[tuple[Target, Array]] = ()  # targets that it should not cover, with their poses : (k, 4, 4)
 
 
 class FilmPath(Kinds):

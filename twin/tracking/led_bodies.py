@@ -1,13 +1,13 @@
 """Bodies besides the probe that cameras track: their looks, and the paths that lead them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.errors import InputError
-from recon.model.rig import BodyName, Part, Rig
+from recon.model.rig import BodyName, Part, Rig, Target
 from scenes.handheld.body_look import Look, look_of
 from twin import conditions
 from twin.tracking.film_path import STILL, Aimed, FilmPath, Way
@@ -75,7 +75,16 @@ class LedBodies(Part):
                 )
         return paths
 
-    def lead(self, name: str, path: FilmPath, rig: Rig, world_from_face: Array, seed: int, errors: conditions.Motion) -> Way:
+    def lead(
+        self,
+        name: str,
+        path: FilmPath,
+        rig: Rig,
+        world_from_face: Array,
+        seed: int,
+        errors: conditions.Motion,
+        others: Sequence[tuple[Target, Array]] = (),
+    ) -> Way:
         """Lead a body of the rig along a path.
 
         Parameters
@@ -83,6 +92,7 @@ class LedBodies(Part):
         world_from_face : (4, 4) mm
             Where the array's face stands; see `Aimed`.
         errors : of hands, which what stands on a post doesn't have
+        others : see `Aimed`
 
         Raises
         ------
@@ -92,7 +102,7 @@ class LedBodies(Part):
         look, target, number = self.look(name), rig.bodies[name], list(rig.bodies).index(name) + 1
         cameras = cameras_of(rig)
         eyes = np.mean([camera.centre for camera in cameras], axis=0)
-        aimed = Aimed(look.line_mm(target), world_from_face, cameras)
+        aimed = Aimed(look.line_mm(target), world_from_face, cameras, others)
         try:
             return path.lead(target, eyes, seed, errors if look.IN_A_HAND else STILL, [number], aimed)
         except InputError as error:

@@ -152,6 +152,31 @@ def test_a_needle_comes_from_where_both_cameras_see_its_target(turn, heading):
     assert (led.heading_deg, led.angle_deg, led.roll_deg) == (0, 35, 0), "where none is in view"
 
 
+def test_a_needle_that_is_filmed_hides_no_other_target():
+    """By rays from each camera to the other target's circles, which meet no plate as large as a board with a hand."""
+    rig = read_rig("three_bodies")
+    face = rigid.transform(np.column_stack([[1, 0, 0], [0, 0, 1], [0, -1, 0]]), [4.0, -2.0, 650.0])
+    target, cameras = rig.bodies["needle"], [device.optics.camera() for device in (rig.cam1, rig.cam2)]
+    probe = face @ rigid.transform(np.eye(3), [-19.7, 0, 0]) @ rigid.invert(rig.probe.target_from_image.matrix())
+
+    def hidden(way):
+        away = []
+        for time in SECONDS[::30]:
+            pose = way.pose(time)
+            for camera in cameras:
+                places = rigid.apply(probe, circle_centres(rig.target))
+                ways = places - camera.centre
+                share = (pose[:3, 3] - camera.centre) @ pose[:3, 2] / (ways @ pose[:3, 2])
+                met = rigid.apply(rigid.invert(pose), camera.centre + share[:, None] * ways)[:, :2]
+                middle = circle_centres(target).mean(axis=0)[:2]
+                away.append(np.abs(met - middle)[share < 1])
+        return bool((np.concatenate(away) < np.array(target.board_mm) / 2).all(axis=1).any())
+
+    alone = Aimed(NEEDLE.line_mm(target), face, cameras)
+    assert hidden(insertion.Kind().lead(target, EYES, 0, aimed=alone)), "the usual way, in the B-scan's plane"
+    assert not hidden(insertion.Kind().lead(target, EYES, 0, aimed=alone._replace(others=[(rig.target, probe[None])])))
+
+
 def test_what_cannot_be_led_to_an_aim_is_refused(config):
     with pytest.raises(InputError, match="expected insertion for a body with a tip"):
         insertion.Kind().lead(config.rig.target, EYES, 0)

@@ -15,15 +15,15 @@ from recon.geometry import rigid
 from recon.model.rig import Finite, NotNegative, Positive, Target, Vector
 from twin import conditions
 from twin.tracking.film_path import STILL, Aimed, FilmPath, Way
-from twin.tracking.views_of_target import in_views
+from twin.tracking.views_of_target import covers, in_views
 
 Array = NDArray[np.float64]
 
 STEPS = 96  # of a round, between which it is smooth
 # tried one after the other, until all cameras see the target: in the plane, then across it
-HEADINGS_DEG = (0.0, 180.0, 30.0, -30.0, 150.0, -150.0, 60.0, -60.0, 120.0, -120.0, 90.0, -90.0)
+HEADINGS_DEG = (0.0, 180.0, *(float(way) for off in range(15, 90, 15) for way in (off, -off, 180 - off, off - 180)), 90.0, -90.0)
 ANGLES_DEG = (35.0, 45.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0)
-ROLLS_DEG = (0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0, 60.0, -60.0)
+ROLLS_DEG = (0.0, *(float(way) for off in range(15, 91, 15) for way in (off, -off)))
 MARGIN, MOST_DEG = 0.04, 60.0  # of the image's width, for the hand's turns; of the target's normal to the line of sight
 PLACES = 8  # of a round, between which a hand wanders
 
@@ -86,8 +86,9 @@ class Kind(FilmPath):
     def in_view(self, target: Target, eyes: Array, aimed: Aimed) -> "Kind":
         """The path with its angle, heading and roll: as given, or else the first by which all cameras see the target.
 
-        It should be seen with its tip at the entry and at the aim. Ways in the B-scan's plane come first, from either side, then
-        those across it; of them flat ones, and of these such as face the cameras. If none does it is led by the first.
+        It should be seen with its tip at the entry and at the aim, and cover no other body's target. Ways in the B-scan's plane
+        come first, from either side, then those across it; of them flat ones, and of these such as face the cameras. If all cover
+        another one, it is led by the first that is seen; if none is, by the first.
         """
         assert aimed.line_mm is not None
         given = (self.heading_deg, self.angle_deg, self.roll_deg)
@@ -100,12 +101,17 @@ class Kind(FilmPath):
             for headings in (tried[0][:2], tried[0][2:])
             for angle, roll, heading in product(*tried[1:], headings)
         ]
+        seen = []
         for way in ways if aimed.cameras else []:
             turn, ends = way._held(eyes, aimed.line_mm, aimed.world_from_face), way.line(aimed.world_from_face)[:2]
             poses = np.stack([rigid.transform(turn, end - turn @ aimed.line_mm[1]) for end in ends])
-            if in_views(poses, target, aimed.cameras, MARGIN, MOST_DEG).all():
+            if not in_views(poses, target, aimed.cameras, MARGIN, MOST_DEG).all():
+                continue
+            seen.append(way)
+            others = [(pose, other) for other, places in aimed.others for pose in places]
+            if not any(covers(own, target, pose, other, aimed.cameras) for own in poses for pose, other in others):
                 return way
-        return ways[0]
+        return (seen or ways)[0]
 
     def _held(self, eyes: Array, line_mm: Array, world_from_face: Array) -> Array:
         """Rotation : (3, 3) of the target in the world, its shaft along the line."""
