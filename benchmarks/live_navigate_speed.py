@@ -98,7 +98,8 @@ def navigated_with_tools(setup: Setup) -> Figures:
         config = load("navigate", [f"capture={capture}", f"lag_s={LAG_S}", "rig=three_bodies", *given], navigate.Config)
         kept: list[Moment] = []
         figures = watched(config, MASSES, kept)
-        off = [each for moment in kept for each in _off(moment, true[NEEDLE], tip_mm)]
+        timeline = playback.timeline_of(playback.read_recording(capture))
+        off = [each for moment in kept for each in _off(moment, timeline, true[NEEDLE], tip_mm)]
     return figures | {
         "off_95_mm": float(np.quantile(off, 0.95)),
         "told_percent": 100 * len(off) / max(len(kept), 1) / len(MASSES),
@@ -134,7 +135,6 @@ def watched(config: navigate.Config, centres: dict[str, tuple[float, float, floa
         reader.terminate()
         reader.wait()
     late, scans = (each.figures() for each in (navigator.outlets[1].latencies, navigator.outlets[1].scans))
-    print(kept[-1].status if kept else kept, len(kept or ()))
     if late is None or scans is None:
         raise RuntimeError("expected moments with B-scans in place, found none")
     latency = {"late_ms": late.median_ms, "latest_ms": late.high_ms, "delivery_ms": playback.DELIVERY_NS * 1e-6}
@@ -148,11 +148,12 @@ def recorded(folder: Path, fields: list[str]) -> Path:
     return folder / "capture"
 
 
-def _off(moment: Moment, true: Track, tip: NDArray[np.float64]) -> Iterator[float]:
+def _off(moment: Moment, timeline: playback.Timeline, true: Track, tip: NDArray[np.float64]) -> Iterator[float]:
     """Errors, mm, of the needle's distances from the masses at a moment; none where the needle or the patient isn't seen."""
     figures = tool_figures.body_of(moment, NEEDLE).figures
     if figures is None or moment.frame_ns is None:
         return
-    place = rigid.apply(true.poses[int(np.abs(true.times - moment.frame_ns).argmin())], tip)
+    recorded = timeline.first + (moment.frame_ns - timeline.first) % timeline.length
+    place = rigid.apply(true.poses[int(np.abs(true.times - recorded).argmin())], tip)
     for name, centre in MASSES.items():
         yield abs(figures.masses[name].mm - (np.linalg.norm(place - centre) - MASS_MM))

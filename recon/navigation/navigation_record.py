@@ -29,7 +29,8 @@ PLANE = ("image_mm", "image_sigma_mm", "crossing_u_px", "crossing_v_px", "crossi
 class RecordTable:
     """A publisher that writes each moment into a table.
 
-    `time_ns` is since 1970, of camera 1's exposure, `frame_ns` by that camera's own clock: of a capture the time in its tables.
+    `time_ns` is since 1970, of camera 1's exposure. `frame_ns` is by that camera's own clock; of a capture it is the time in its
+    tables, which goes on in later rounds.
     The patient's pose is as the cameras see it; all others are in the world in which skin and masses were measured.
     """
 
