@@ -1,15 +1,17 @@
 """`python -m campaign [PART ...] [count=N]`: attack every command, write what came of it to outputs/campaign/ and docs/trust.md.
 
-Parts: bad_inputs, mistakes, foreign, fuzzing, kills, full_disk, two_writers, soak; all of them take some hours. A part that was
-done is kept in outputs/campaign/PART.md until it is asked for by name.
+Parts: bad_inputs, mistakes, set_ups, foreign, fuzzing, kills, full_disk, two_writers, soak; all of them take some hours. A part
+that was done is kept in outputs/campaign/PART.md until it is asked for by name.
 """
 
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from campaign import bad_inputs, foreign, full_disk, fuzzing, kills, mistakes, soak, sources, two_writers
+from campaign.mistaken_tasks import TASKS, WIRED, Task
 from recon.files import atomic
 from twin.experiments import document_tables
 
@@ -47,12 +49,14 @@ def _foreign(place: Path, count: int) -> tuple[list[str], int]:
     return foreign.table(found), sum(bool(one.lost) or one.status == -1 for one in found)
 
 
-def _mistakes(place: Path, count: int) -> tuple[list[str], int]:
-    begun = OUT / "mistakes_begun.csv"  # goes on from there after an end in between
-    found = mistakes.run(place, count, WORKERS, begun)
-    begun.replace(OUT / "mistakes.csv")
+def _mistakes(place: Path, count: int, name: str = "mistakes", tasks: Sequence[Task] = TASKS) -> tuple[list[str], int]:
+    begun = OUT / f"{name}_begun.csv"  # goes on from there after an end in between
+    found = mistakes.run(place, count, WORKERS, begun, tasks)
+    begun.replace(OUT / f"{name}.csv")
     wrong = sum(one.outcome == "silently wrong" for one in found)
-    return mistakes.table(found), wrong * (wrong > mistakes.SILENT * count) + sum(one.outcome == "traceback" for one in found)
+    named, harmful = mistakes.named(found, tasks)
+    lines = [*mistakes.table(found), "", f"Of {harmful} that aren't harmless {named} are named, {100 * named / harmful:.0f} %."]
+    return lines, wrong * (wrong > mistakes.SILENT * count) + sum(one.outcome == "traceback" for one in found)
 
 
 def _fuzzing(place: Path, count: int) -> tuple[list[str], int]:
@@ -84,6 +88,7 @@ PARTS = {
     "bad_inputs": Part("bad inputs of every verb", _bad_inputs, 1600),
     "foreign": Part("files of others where each command writes", _foreign, 0),
     "mistakes": Part("plausible mistakes over the verbs", _mistakes, 500),
+    "set_ups": Part("wrong set-ups of a probe's calibration", partial(_mistakes, name="set_ups", tasks=WIRED), 200),
     "fuzzing": Part("seconds of fuzzing of each reader", _fuzzing, 600),
     "kills": Part("moments of kills of each command, by each signal", _kills, 50),
     "full_disk": Part("full disks", _full_disk, 0, full_disk.can_mount),

@@ -18,11 +18,12 @@ from torch import Tensor, nn
 
 from recon.errors import InputError, brief, reason
 from recon.files import atomic
-from recon.tracking.networks import TRAINED_FOR
+from recon.tracking.networks import TRAINED_FOR, WEIGHTS
 from trainers import architectures
 from trainers.architectures import Name, is_detector, weights_of
 from trainers.shard_reader import PATCH, VIEW
 
+SHIPPED = Path("shipped")  # in the place of folders: the published networks that come with sonotwin
 OPSET = 17
 DAMAGE = (  # what reading damaged files of weights ends in
     *(RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
@@ -76,7 +77,7 @@ def copy_published(
 
     Parameters
     ----------
-    sources : folders, in one of which detector.pt lies, and in one segmenter.pt
+    sources : folders, in one of which detector.pt lies, and in one segmenter.pt; or SHIPPED alone
     names : network -> file
 
     Raises
@@ -85,18 +86,24 @@ def copy_published(
         If a file is in none of the folders or in several, damaged, or of another network, with the way to such a one.
     """
     for network, name in names.items():
-        file = f"{network.removeprefix('published_')}.pt"
-        there = [path for source in sources if (path := source / file).exists()]
-        if len(there) != 1:
-            places = ", ".join(map(str, sources))
-            raise InputError(f"networks: expected {file} in one folder of {places}, found it in {len(there)}")
-        module = architectures.network(network, circles=3)
+        path, module = _published(network, sources), architectures.network(network, circles=3)
         try:
-            load(there[0], module)
+            load(path, module)
         except InputError as error:
             raise InputError(f"{error}; sonotwin train network={network} makes the published shape") from None
         save(folder / name, module)
     return f"networks    {', '.join(names.values())}"
+
+
+def _published(network: str, sources: Sequence[Path]) -> Path:
+    if list(sources) == [SHIPPED]:
+        return WEIGHTS / f"{network}.safetensors"
+    file = f"{network.removeprefix('published_')}.pt"
+    there = [path for source in sources if (path := source / file).exists()]
+    if len(there) != 1:
+        places = ", ".join(map(str, sources))
+        raise InputError(f"networks: expected {file} in one folder of {places}, found it in {len(there)}; or give {SHIPPED}")
+    return there[0]
 
 
 def check_tensors(path: Path, kind: str, found: object, expected: Mapping[Any, Tensor]) -> None:

@@ -76,7 +76,6 @@ BENDS = 0.01  # of a radius, by which speckle on its slopes may bend all arcs al
 LIKELY_MM = 0.5  # from the surface, of points that are read rightly
 LAGS_S = np.array([-0.28, -0.24, -0.2, -0.16, -0.12, -0.08, -0.04, 0.04, 0.08, 0.12, 0.16, 0.2, 0.24, 0.28])  # tried
 MOST_TRIED, REFINED_TRIED = 40, 2  # frames and starts, of a refusal
-UNITS = {"m": 1e3, "cm": 10.0, "inches": 25.4}  # mm
 WEAK_DEG, WEAK_SHARE = 6.0, 0.08  # rms turns, and places as a share of the image, below which a motion is the cause
 
 
@@ -758,7 +757,7 @@ def _readings(frames: CurveSightings) -> Iterator[tuple[str, CurveSightings]]:
     """Common mistakes, each with the frames as they would be without."""
     for meaning, poses in probe_checks.readings(frames.poses).items():
         yield f"poses of {meaning}", replace(frames, poses=poses)
-    for unit, length in UNITS.items():
+    for unit, length in probe_checks.POSE_UNITS.items():
         poses = frames.poses.copy()
         poses[:, :3, 3] *= length
         yield f"poses in {unit}", replace(frames, poses=poses)

@@ -281,7 +281,7 @@ def find_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> FreeLag
 
 def name_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> str:
     """The lag at which frames that contradict each other would agree, in words; nothing without one."""
-    kind = registry.kind(PHANTOMS, frames.phantom)
+    kind, expected = registry.kind(PHANTOMS, frames.phantom), settings.rig.probe.target_from_image.matrix()
     if settings.lag_s == FREE or not sweep.clocked or not hasattr(kind, "misfit") or len(frames.usable) < kind.MIN_FRAMES:
         return ""
     speeds = np.linalg.norm(rates(sweep, settings.taken_lag_s)[frames.usable, :3, 3], axis=1)
@@ -292,8 +292,13 @@ def name_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> str:
     except InputError:
         return ""
     here = kind.misfit(phantom_frames.at_poses(frames, tracks.poses_at(sweep.track, sweep.times, settings.taken_lag_s)), settings)
-    if here < free_lag.CONTRADICTS_MM2 or abs(lag_s - settings.taken_lag_s) < free_lag.STEPS_S[0] or least > here / 2:
+    if abs(lag_s - settings.taken_lag_s) < free_lag.STEPS_S[0] or least > here:
         return ""
+    if here < free_lag.CONTRADICTS_MM2 or least > here / 2:  # a phantom of another size fits a lag, too
+        try:
+            kind.calibrate(at_lag(frames, sweep, lag_s, 0.0, 0.0, settings.noise), settings, expected)
+        except InputError:
+            return ""
     return f"; with lag_s={lag_s:.2f} they agree: give lag_s={FREE}"
 
 

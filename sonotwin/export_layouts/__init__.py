@@ -60,8 +60,8 @@ class Settings(Part):
     data: Folders = Field(default=[])
     """data sets of `sonotwin dataset`, one or several, for markerpose"""
     networks: Folders = Field(default=[])
-    """folders with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`; they
-    go out by the names that the scripts load"""
+    """folders with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`, or
+    shipped, those that come with sonotwin; they go out by the names that the scripts load"""
 
     @property
     def source(self) -> Path:
