@@ -52,13 +52,14 @@ class Batches(Dataset[Batch]):
     size: int
     crop_px: int  # of views
     seed: int
+    scales: tuple[float, float] = SCALES  # of views, least and most
 
     def __getitem__(self, index: int) -> Batch:
         generator = generator_of(self.seed, index)
         if isinstance(self.data, Patches):
             some = discs(self.data, self.size, generator)
             return some.images, some.masks, some.weights
-        some = crops(self.data, self.size, self.crop_px, generator)
+        some = crops(self.data, self.size, self.crop_px, generator, self.scales)
         return some.images, some.labels.pixel, some.labels.identity
 
     def since(self, step: int, loaders: int) -> Iterator[Batch]:
@@ -100,7 +101,7 @@ def generator_of(seed: int, step: int) -> Generator:
     return Generator().manual_seed(int(state >> np.uint64(1)))
 
 
-def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
+def crops(views: Views, size: int, edge: int, generator: Generator, scales: tuple[float, float] = SCALES) -> Crops:
     """Crops of `edge` px of `size` random views, turned, scaled and photographed anew."""
     which = torch.randint(len(views), (size,), generator=generator).numpy()
     images = views.images[which]
@@ -110,7 +111,7 @@ def crops(views: Views, size: int, edge: int, generator: Generator) -> Crops:
     height, width = images.shape[1:]
     shown = (centres >= -0.5).all(-1) & (centres < torch.tensor([width, height]) - 0.5).all(-1)
     visible = torch.where(shown, visible, torch.zeros(()))  # beyond the view there is nothing to find
-    linear = turns(size, SCALES, generator)
+    linear = turns(size, scales, generator)
     anywhere = torch.rand(size, 2, generator=generator) * torch.tensor([width - 1.0, height - 1.0])
     about = (torch.rand(size, generator=generator) < TARGET_IN_CROP) & (visible >= SEEN).any(1)
     middle = _middle(centres, visible, torch.from_numpy(views.body[which]), generator)

@@ -21,7 +21,7 @@ from recon.files import atomic, json_text
 from recon.files.regular import read_bytes
 from trainers import checkpoints
 from trainers.architectures import Name, is_detector
-from trainers.batches import Batches
+from trainers.batches import SCALES, Batches
 from trainers.checkpoints import TRAIN
 from trainers.labels import Labels, detector_loss, segmenter_loss
 from trainers.network_metrics import measure_detector, measure_segmenter
@@ -59,6 +59,7 @@ class Plan:
     validate_at_most: int = 200  # views or patches at each checkpoint; at the end it is all
     precision: Precision = "auto"
     loaders: int = 0  # processes that make batches ahead
+    scales: tuple[float, float] = SCALES  # least and most, of the views that a detector's crops are of
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
         if (folder / LOG).is_file():
             atomic.list_again(folder, LOG, TRAIN)
 
-    batches = Batches(train, plan.batch, plan.crop_px, plan.seed).since(step, plan.loaders)
+    batches = Batches(train, plan.batch, plan.crop_px, plan.seed, plan.scales).since(step, plan.loaders)
     with interrupts.held_back() as came:
         seconds = before
         while (done := progress(plan, step, seconds)) < 1:

@@ -22,7 +22,7 @@ from typing import Annotated
 
 import torch
 from matplotlib.figure import Figure
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
@@ -37,6 +37,7 @@ from sonotwin.console_watch import LineConsole
 from sonotwin.folder_lists import Folders, listed
 from trainers import data_sets, export, fit, free_memory, shard_reader
 from trainers.architectures import Name, is_detector, network
+from trainers.batches import SCALES
 from trainers.checkpoints import TRAIN
 from trainers.fit import Fitted, Plan, Precision
 from trainers.shard_reader import Data
@@ -52,6 +53,9 @@ MEMORY_SHARE = 0.5  # of what is free, for images, if memory_gb isn't given
 
 
 SomeFolders = Annotated[Folders, Field(min_length=1)]
+
+
+Scale = Annotated[float, Field(ge=0.1, le=4)]
 
 
 class Config(BaseModel):
@@ -71,6 +75,7 @@ class Config(BaseModel):
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.05
     batch: Annotated[int, Field(ge=2, le=4096)] | None = None
     crop_px: Annotated[int, Field(ge=64, le=240, multiple_of=8)] = 160
+    scales: tuple[Scale, Scale] = SCALES
     learning_rate: Annotated[float, Field(gt=0, le=1)] = 0.002
     weight_decay: Annotated[float, Field(ge=0, le=1)] = 0.01
     precision: Precision = "auto"
@@ -85,6 +90,13 @@ class Config(BaseModel):
         if self.steps is None and self.max_minutes is None:
             raise ValueError("expected steps or max_minutes, found neither")
         return self
+
+    @field_validator("scales")
+    @classmethod
+    def _least_first(cls, given: tuple[float, float]) -> tuple[float, float]:
+        if given[0] > given[1]:
+            raise ValueError(f"expected the least first, found {list(given)}")
+        return given
 
     @property
     def memory(self) -> float:
@@ -107,6 +119,7 @@ class Config(BaseModel):
             self.checkpoint_minutes,
             precision=self.precision,
             loaders=self.loaders,
+            scales=self.scales,
         )
 
 
