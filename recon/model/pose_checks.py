@@ -188,14 +188,14 @@ def find(times_s: Array, poses: Array, images: Images | None = None, clock: Arra
 def in_no_order(poses: Array) -> bool:
     """Whether places : (n, 4, 4), NaN where there is none, lie as far from the next as from any, as in a table that was shuffled.
 
-    Poses at rest, each at another place, do so by right.
+    Poses at rest, each at another place, do so by right; places that are all the same are in any order.
     """
     places = poses[np.isfinite(poses).all(axis=(1, 2)), :3, 3]
     if len(places) < LIMITS.alone:
         return False
     orders = np.arange(len(places)), np.random.default_rng(0).permutation(len(places))
     step, apart = (float(np.median(np.linalg.norm(np.diff(places[order], axis=0), axis=1))) for order in orders)
-    return step > LIMITS.no_order * apart
+    return apart > LIMITS.spike_mm and step > LIMITS.no_order * apart
 
 
 def unit_fault(poses: Array, unit: str = "") -> str | None:

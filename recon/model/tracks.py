@@ -181,7 +181,7 @@ def shares_at(track: Track, times: NDArray[np.int64], lag_s: float) -> Array:
 
 
 def covariance_at(track: Track, times: NDArray[np.int64], lag_s: float = 0.0) -> Array | None:
-    """Covariance : (n, 6, 6) of the poses of `poses_at`; NaN where there is none. None if the track has none.
+    """Covariance : (n, 6, 6) of the poses of `poses_at`; NaN outside of the track. None if the track has none.
 
     A pose between two others shares the errors of both, taken as independent: halfway its variance is half of theirs.
     """
@@ -189,11 +189,13 @@ def covariance_at(track: Track, times: NDArray[np.int64], lag_s: float = 0.0) ->
 
 
 def shared_at(track: Track, times: NDArray[np.int64], lag_s: float = 0.0) -> Array | None:
-    """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN where there is none. None if the track has none."""
+    """Covariance : (n, 6, 6) of what errs alike in all these poses; NaN outside of the track. None if the track has none."""
     return None if track.shared is None else _blended(track.shared, *neighbours_at(track, times, lag_s), power=1)
 
 
 def _blended(covariance: Array, numbers: NDArray[np.intp], shares: Array, power: int) -> Array:
+    if not len(covariance):
+        return np.full((len(numbers), 6, 6), np.nan)
     return np.einsum("nk,nkij->nij", shares**power, covariance[numbers])
 
 

@@ -81,6 +81,11 @@ class DotSightings:
     pose_rates: Array | None = None  # (n, 4, 4) change of the poses a second, by which a lag of the B-scans moves them back
     lag_sigma_s: float = 0.0  # s, standard deviation of the lag
 
+    def of(self, chosen: NDArray) -> "DotSightings":
+        """Those of some frames, by number or mask."""
+        values = {name: getattr(self, name) for name in ("poses", "pixels", "pixel_covariance", "pose_covariance", "pose_rates")}
+        return replace(self, **{name: None if value is None else value[chosen] for name, value in values.items()})
+
 
 @dataclass(frozen=True)
 class _Frames:
@@ -543,7 +548,7 @@ def calibrate(
     solved = _solve(problem, found)
     sizes, late = _size(problem, solved), _lateness(problem, found, solved)
     if abs(sizes[0] - 1) > max(SURE * sizes[1], MAX_SIZE):
-        raise InputError(
+        raise probe_checks.Misread(
             f"wires: expected a phantom of the size that the probe's motion asks for, found it {100 * (sizes[0] - 1):+.1f} ± "
             f"{100 * sizes[1]:.1f} % larger: another phantom than defined, or poses of another unit or scale"
         )
@@ -823,4 +828,4 @@ def _refuse(problem: _Problem, found: _Fit, rms: float, numbers: NDArray[np.int6
     noise = (
         f"residuals of {rms:.1f} mm (rms), {found.level:.1f} times the assumed noise, of the {agree:.0f} % of the dots that agree"
     )
-    raise InputError(f"dots: expected on the wires of a phantom at rest, found {noise}; farthest off: {farthest}")
+    raise probe_checks.Misread(f"dots: expected on the wires of a phantom at rest, found {noise}; farthest off: {farthest}")

@@ -1,11 +1,11 @@
 """Mistakes behind frames of a probe's calibration that are refused: other readings by which they would be taken.
 
 A reading is named if the frames misfit far less by it, and the phantom then calibrates the probe without a complaint. Frames that
-agree up to some moment, and again from there on, show that something moved.
+agree up to some moment, or from there on, show that something changed.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
@@ -20,53 +20,49 @@ from recon.probe_calibration.phantom_frames import PhantomFrames
 Array = NDArray[np.float64]
 Misfit = Callable[[PhantomFrames], float]
 
-MOST_TRIED = 24  # frames, evenly over all
+MOST_TRIED = 24  # frames, evenly over all, and places of a change
 LESS, AS_WELL = 1 / 8, 1.5  # of the misfit as given, up to which a reading may be right: of frames that contradict, and of others
-LARGE_MM2 = 4.0  # misfit of frames that are at no rest by any reading; 9 at most
 MOST_LATE = 3  # frames
 FEWEST_AFTER = 3  # frames of those that don't agree with the others
 FACES_DEG = 150.0  # between the normals of a target that cameras see from its front, at most
 
 
-def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Array, agree: bool) -> str | None:
-    """Name the likely mistake in frames that a phantom's `calibrate` refuses, in words; None without one.
+def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Array, agree: bool) -> str:
+    """Name the likely mistake in frames that a phantom's `calibrate` refuses as misread, to be added to that; or nothing.
 
     Parameters
     ----------
     kind, settings, expected : of the phantom, with its `misfit`, and as its `calibrate` takes them
-    agree : whether the frames agree, by a calibration that can't be
+    agree : of `probe_checks.Misread`
     """
 
     def misfit(some: PhantomFrames) -> float:
-        return kind.misfit(_some(some, np.unique(np.linspace(0, len(some.usable) - 1, MOST_TRIED).astype(int))), settings)
+        if len(some.usable) < kind.MIN_FRAMES:
+            return np.inf
+        return kind.misfit(_some(some, _evenly(0, len(some.usable) - 1)), settings)
 
-    if len(frames.usable) < kind.MIN_FRAMES:
-        return None
     here = misfit(frames)
-    tried = [(misfit(other), meaning, other) for meaning, other in _readings(frames, kind)]
-    likely = []
-    for value, meaning, other in tried:
-        if value > (AS_WELL if agree else LESS) * here:
+    most, likely = (AS_WELL if agree else LESS) * here, []
+    for meaning, other in _readings(frames, kind):
+        if (value := misfit(other)) > most:
             continue
         try:
             found = kind.calibrate(other, settings.model_copy(update={"max_sigma_mm": np.inf}), expected).calibration
         except InputError:
             continue
-        away = probe_checks.off_design(found, frames.size, expected)[1]
-        likely.append((value / float(np.prod(found.scale)), away, meaning))  # px^2, which any unit of the poses leaves as it is
+        likely.append((value / float(np.prod(found.scale)), meaning, found))  # px^2, which is alike in any unit of the poses
     if likely:
-        least = min(value for value, *_ in likely)
-        nearest = min(each[1:] for each in likely if each[0] <= AS_WELL * least)
-        return f"{nearest[1]}: read so, they agree"
-    if moved := _moved(frames, kind.MIN_FRAMES, LESS * here, misfit):
-        return moved
-    normals = frames.sightings.poses[:, :3, 2]
-    if (turned := float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())) > FACES_DEG:
-        cause = "degrees read as radians, or a quaternion's numbers in another order?"
-        return f"a target that faces to all sides, up to {turned:.0f} deg from one another, as cameras see none: {cause}"
-    if agree or here < LARGE_MM2:
-        return None
-    return f"{'a lag, or ' if _in_motion(frames) else ''}poses in the frame of another body, or of something that moves"
+        best = [each for each in likely if each[0] <= AS_WELL * min(value for value, *_ in likely)]
+        away = {
+            meaning: probe_checks.off_design(found, frames.size, expected)[1]
+            for _, meaning, found in best
+            if probe_checks.near(found, frames.size, expected)
+        }
+        meant = min(away, key=lambda meaning: away[meaning]) if away else " or ".join(meaning for _, meaning, _ in best)
+        return f"; likely {meant}: read so, they agree"
+    if agree:
+        return ""
+    return _changed(frames, kind.MIN_FRAMES, LESS * here, misfit) or _faces(frames)
 
 
 def _readings(frames: PhantomFrames, kind: ModuleType) -> Iterator[tuple[str, PhantomFrames]]:
@@ -78,27 +74,35 @@ def _readings(frames: PhantomFrames, kind: ModuleType) -> Iterator[tuple[str, Ph
         longer = poses.copy()
         longer[:, :3, 3] *= length
         yield f"poses in {unit}", _at(frames, longer)
-    yield "poses in reversed order", _in_order(frames, np.arange(len(frames.poses))[::-1])
-    every = np.arange(len(frames.poses))
+    count = np.isfinite(frames.poses).all(axis=(1, 2)).sum()
+    yield "poses in reversed order", _in_order(frames, np.arange(count)[::-1])
     if not _in_motion(frames):  # else a lag explains more
         for late in range(1, MOST_LATE + 1):
-            yield f"B-scans late by {late} of the poses", _in_order(frames, every - late)
-            yield f"B-scans early by {late} of the poses", _in_order(frames, every + late)
+            yield f"B-scans late by {late} of the poses", _in_order(frames, np.arange(count) - late)
+            yield f"B-scans early by {late} of the poses", _in_order(frames, np.arange(count) + late)
     for meaning, known in kind.others(frames.known) if hasattr(kind, "others") else ():
         yield meaning, replace(frames, known=known)
 
 
-def _moved(frames: PhantomFrames, least: int, most: float, misfit: Misfit) -> str | None:
-    """Say between which frames something moved, if many at one end agree to a misfit at most, and never all."""
+def _changed(frames: PhantomFrames, least: int, most: float, misfit: Misfit) -> str:
+    """Say between which frames something changed, if many at one end agree to a misfit at most, and never all."""
     count, numbers = len(frames.usable), frames.numbers[frames.usable]
-    for size in range(count - FEWEST_AFTER, max(least, count // 2) - 1, -1):
+    for size in _evenly(max(least, count // 2), count - FEWEST_AFTER)[::-1].tolist():
         for first, kept in ((size, np.arange(size)), (count - size, np.arange(count - size, count))):
             if misfit(_some(frames, kept)) < most:
-                return (
-                    f"frames {numbers[kept[0]]} to {numbers[kept[-1]]} that agree with one another, but not with the others: "
-                    f"a bracket that slipped, or a phantom that was pushed, before frame {numbers[first]}"
-                )
-    return None
+                cause = "a bracket that slipped, a phantom that was pushed, another depth setting, or B-scans that were lost"
+                agree = f"frames {numbers[kept[0]]} to {numbers[kept[-1]]} agree with one another, but not with the others"
+                return f"; {agree}: {cause}, at about frame {numbers[first]}"
+    return ""
+
+
+def _faces(frames: PhantomFrames) -> str:
+    """Ask about a target that faces to all sides."""
+    normals = frames.sightings.poses[:, :3, 2]
+    turned = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
+    if turned < FACES_DEG:
+        return ""
+    return f"; the target's face turns by up to {turned:.0f} deg, as cameras see none: are degrees read as radians?"
 
 
 def _in_motion(frames: PhantomFrames) -> bool:
@@ -113,19 +117,20 @@ def _at(frames: PhantomFrames, poses: Array) -> PhantomFrames:
 
 
 def _in_order(frames: PhantomFrames, order: NDArray[np.intp]) -> PhantomFrames:
-    """The usable frames at poses of others : (n,) by number, as far as there are such."""
-    there = order[frames.usable]
-    chosen = np.flatnonzero((there >= 0) & (there < len(order)))
-    poses = frames.poses[there[chosen]]
-    found = np.isfinite(poses).all(axis=(1, 2))
-    return _at(_some(frames, chosen[found]), poses[found])
+    """The usable frames at poses of others : (m,), by their numbers among those that have a pose, as far as there are such."""
+    posed = np.flatnonzero(np.isfinite(frames.poses).all(axis=(1, 2)))
+    there = order[np.searchsorted(posed, frames.usable)]
+    chosen = np.flatnonzero((there >= 0) & (there < len(posed)))
+    return _at(_some(frames, chosen), frames.poses[posed[there[chosen]]])
 
 
 def _some(frames: PhantomFrames, chosen: NDArray[np.intp]) -> PhantomFrames:
     """Some of the usable frames, by number from 0 on."""
-    which, sightings = frames.usable[chosen], frames.sightings
-    values = {each.name: getattr(sightings, each.name) for each in fields(sightings)}
-    own = {name: value[chosen] for name, value in values.items() if isinstance(value, np.ndarray)}
-    seen = tuple(frames.seen[k] for k in which)
-    own_poses = frames.poses[which] if len(frames.poses) else frames.poses
-    return replace(frames, sightings=replace(sightings, **own), numbers=frames.numbers[which], seen=seen, poses=own_poses)
+    which = frames.usable[chosen]
+    seen, poses = tuple(frames.seen[k] for k in which), frames.poses[which]
+    return replace(frames, sightings=frames.sightings.of(chosen), numbers=frames.numbers[which], seen=seen, poses=poses)
+
+
+def _evenly(first: int, last: int) -> NDArray[np.intp]:
+    """At most MOST_TRIED whole numbers from one to another."""
+    return np.unique(np.linspace(first, last, MOST_TRIED).astype(int))

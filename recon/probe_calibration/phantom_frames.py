@@ -104,7 +104,7 @@ class PhantomFrames:
     first_row: int = 0  # px, of the part of the images that was looked at
     phantom: str = CROSSED_WIRES  # its kind
     known: Any = None  # of the phantom, by its kind's `read`
-    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # (n, 4, 4) NaN where there is none
+    poses: Array = field(kw_only=True)  # (n, 4, 4) NaN where there is none
 
     @property
     def usable(self) -> NDArray[np.int64]:
@@ -136,7 +136,7 @@ def look(
     """
     kind = registry.kind(PHANTOMS, phantom)
     seen = tuple(kind.find(image, appearance, known).shifted(corner) for image in images)
-    frames = PhantomFrames(name, size, None, numbers, seen, corner[1], phantom, known)
+    frames = PhantomFrames(name, size, None, numbers, seen, corner[1], phantom, known, poses=poses)
     return at_poses(frames, poses, pose_covariance, pose_rates, lag_sigma_s)
 
 
@@ -162,7 +162,8 @@ def at_poses(
 
 def some(frames: PhantomFrames, chosen: NDArray[np.intp]) -> PhantomFrames:
     """Some of the frames, by number from 0 on, before they are put at poses."""
-    return replace(frames, sightings=None, numbers=frames.numbers[chosen], seen=tuple(frames.seen[k] for k in chosen))
+    seen = tuple(frames.seen[k] for k in chosen)
+    return replace(frames, sightings=None, numbers=frames.numbers[chosen], seen=seen, poses=frames.poses[chosen])
 
 
 def of_pairs(name: str, size: Size, poses: Array, pixels: Array) -> PhantomFrames:

@@ -628,4 +628,4 @@ def _refuse(rms: float, factor: float, inliers: Mask, farthest: str) -> None:
     """Refuse frames that don't show one point at rest."""
     few = f"only {inliers.sum()} of {len(inliers)} that agree"
     found = few if inliers.mean() < MIN_INLIERS else f"residuals of {rms:.1f} mm (rms), {factor:.1f} times the assumed noise"
-    raise InputError(f"sightings: expected frames of one point at rest, found {found}; {farthest}")
+    raise probe_checks.Misread(f"sightings: expected frames of one point at rest, found {found}; {farthest}")

@@ -30,6 +30,15 @@ POSE_UNITS = {"m": 1e3, **UNITS}  # mm
 AXES = ("c0-c1", "c0-c2", "normal")  # of the target
 
 
+class Misread(InputError):
+    """Frames that another reading of their poses may explain."""
+
+    def __init__(self, fault: str, agree: bool = False, likely: str = "") -> None:
+        """`agree`: whether they agree, but by a probe that can't be; `likely`: the reading, in words."""
+        super().__init__(fault + likely)
+        self.fault, self.agree = fault, agree
+
+
 class _Frames(Protocol):
     @property
     def poses(self) -> Array: ...
@@ -181,16 +190,17 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
     for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
         if not SCALES[0] <= value <= SCALES[1]:
             found = f"{value:.3g} with {described(calibration)}: are the poses in mm?"
-            raise InputError(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}")
-    if expected is None or _near(calibration, size, expected):
+            raise Misread(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}", agree=True)
+    if expected is None or near(calibration, size, expected):
         return
     off = _off_if_confused(calibration, size, expected)
     alike = {name: angle for name, (angle, away) in off.items() if angle < ALIKE_DEG and away < ALIKE_MM}
     if alike:
         name = min(alike, key=lambda each: alike[each])
         close = f"found it there to {off[name][0]:.0f} deg and {off[name][1]:.0f} mm, but as if {name}"
-        raise InputError(
-            f"calibration: expected target_from_image near its design, {close}; if it is right, give {described(calibration)}"
+        raise Misread(
+            f"calibration: expected target_from_image near its design, {close}; if it is right, give {described(calibration)}",
+            agree=True,
         )
 
 
@@ -218,7 +228,7 @@ def doubts(calibration: ProbeCalibration, size: Size, expected: Array) -> Iterat
     deep = (size[1] - 1) * calibration.scale[1]
     if not DEPTHS[0] <= deep <= DEPTHS[1]:
         yield f"the image is {deep:.3g} mm deep: are the poses in mm?"
-    if _near(calibration, size, expected):
+    if near(calibration, size, expected):
         return
     angle, away = off_design(calibration, size, expected)
     yield (
@@ -297,7 +307,8 @@ def off_design(calibration: ProbeCalibration, size: Size, expected: Array) -> tu
     return _angle(expected[:3, :3].T @ calibration.target_from_image[:3, :3]), float(np.linalg.norm(away))
 
 
-def _near(calibration: ProbeCalibration, size: Size, expected: Array) -> bool:
+def near(calibration: ProbeCalibration, size: Size, expected: Array) -> bool:
+    """Whether a probe is as designed, but for what brackets differ by."""
     angle, away = off_design(calibration, size, expected)
     return angle < FAR_DEG and away < FAR_MM
 

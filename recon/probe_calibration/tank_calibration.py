@@ -211,6 +211,8 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
         if not settings.tank_known:
             probe_checks.scanner_scale(implied[0], found.calibration)
         probe_checks.speed(implied[0], found.calibration, SPEEDS if settings.tank_known else probe_checks.WATER)
+    except probe_checks.Misread:
+        raise
     except InputError as error:
         raise InputError(f"{frames.name}: {error}") from None
     if not settings.tank_known:
@@ -226,12 +228,9 @@ def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.f
     kind = registry.kind(PHANTOMS, frames.phantom)
     try:
         return kind.calibrate(frames, settings, expected)
-    except InputError as error:
-        agree = str(error).startswith("calibration:")  # as those of a mirrored image do, whose probe is far from its design
-        mistake = misreadings.explain(frames, kind, settings, expected, agree) if hasattr(kind, "misfit") else None
-        if mistake is None:
-            raise
-        raise InputError(f"{error}; likely {mistake}") from None
+    except probe_checks.Misread as error:
+        likely = misreadings.explain(frames, kind, settings, expected, error.agree) if hasattr(kind, "misfit") else ""
+        raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.agree, likely) from None
 
 
 def _design_sy(found: ProbeCalibration, size: tuple[int, int], design: Probe) -> float:

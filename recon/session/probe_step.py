@@ -30,6 +30,7 @@ from recon.probe_calibration.free_lag import FreeLag
 from recon.probe_calibration.lateness import Lateness
 from recon.probe_calibration.phantom_frames import NO_POSE, PHANTOMS, STYLUS, PhantomFrames
 from recon.probe_calibration.point_calibration import Noise
+from recon.probe_calibration.probe_checks import Misread
 from recon.probe_calibration.tank_calibration import Result
 from recon.registry import Choice
 from recon.session.settings import ScaleFields
@@ -159,7 +160,9 @@ def run(settings: Settings, out: Path, usual: Probe, watch: Watch = SILENT) -> N
     try:
         found = calibrate(frames, design, settings, settings.scanner_sy(design, usual), watch)
     except InputError as error:
-        raise InputError(f"{error}{'' if sweep is None else name_lag(frames, sweep, settings)}") from None
+        late = "" if sweep is None else name_lag(frames, sweep, settings)
+        fault = error.fault if late and isinstance(error, Misread) else error  # which a lag explains
+        raise InputError(f"{fault}{late}") from None
     figures = found.figures
     if lag is not None:
         figures = figures | measure_lag(lag, found)
@@ -294,7 +297,7 @@ def name_lag(frames: PhantomFrames, sweep: Sweep, settings: Settings) -> str:
     here = kind.misfit(phantom_frames.at_poses(frames, tracks.poses_at(sweep.track, sweep.times, settings.taken_lag_s)), settings)
     if abs(lag_s - settings.taken_lag_s) < free_lag.STEPS_S[0] or least > here:
         return ""
-    if here < free_lag.CONTRADICTS_MM2 or least > here / 2:  # a phantom of another size fits a lag, too
+    if here < free_lag.CONTRADICTS_MM2 or least > here / 2:  # late B-scans fit a phantom of another size, too
         try:
             kind.calibrate(at_lag(frames, sweep, lag_s, 0.0, 0.0, settings.noise), settings, expected)
         except InputError:

@@ -51,7 +51,9 @@ def over_crossing(rig, lag_s, rng, seconds=40.0, rest=False):
     poses = probe_motions.poses_of(probe, turn_at(moments), pixel_at(moments))
     seen = pixel_at(taken) + CROSSING_PX * rng.standard_normal((len(taken), 2))
     crossings = tuple(Crossing(pixel, CROSSING_PX**2 * np.eye(2), 20.0) for pixel in seen)
-    frames = PhantomFrames("drawn", bscans.SIZE, None, np.arange(len(taken)), crossings)
+    frames = PhantomFrames(
+        "drawn", bscans.SIZE, None, np.arange(len(taken)), crossings, poses=np.full((len(taken), 4, 4), np.nan)
+    )
     return _sweep(stamps, moments, poses, rng), frames
 
 
@@ -78,5 +80,6 @@ def over_rows(rig, lag_s, rng, seconds=40.0):
     seen += wire_rows.PIXEL_PX * rng.standard_normal(seen.shape)
     own = np.tile(wire_rows.PIXEL_PX**2 * np.eye(2), (1, phantom.count, 1, 1))
     dots = tuple(Dots(pixels[None], own, 20.0) for pixels in seen)
-    frames = PhantomFrames("drawn", bscans.SIZE, None, np.arange(len(taken)), dots, phantom="n_wires", known=plus_phantom.FCAL)
+    numbers, none = np.arange(len(taken)), np.full((len(taken), 4, 4), np.nan)
+    frames = PhantomFrames("drawn", bscans.SIZE, None, numbers, dots, phantom="n_wires", known=plus_phantom.FCAL, poses=none)
     return _sweep(stamps, moments, poses_at(moments), rng), frames

@@ -47,6 +47,17 @@ def test_targets_of_a_batch_have_their_circles_in_the_real_order(data_set):
     assert (turn[torch.isfinite(turn)] < 0).all()
 
 
+@pytest.mark.parametrize("scales", [(0.4, 0.5), (1.0, 1.6)])
+def test_targets_of_a_batch_are_as_large_as_asked_for(data_set, scales):
+    """Over their own size, but for views that are made narrower by up to 15 %."""
+    views = in_memory(read_views([data_set]))
+    own = np.linalg.norm(views.centres[:, 1] - views.centres[:, 0], axis=-1) / views.scale[:, 0]
+    places = crops(views, 256, 160, generator_of(3, 5), scales).places
+    sizes = np.linalg.norm(places[:, 1] - places[:, 0], axis=-1)
+    sizes, own = sizes[np.isfinite(sizes)], own[np.isfinite(own)]
+    assert 0.84 * scales[0] * own.min() < sizes.min() and sizes.max() < 1.01 * scales[1] * own.max()
+
+
 def test_dark_rings_are_where_a_batch_says(data_set):
     """Blindly: on a white board a ring's middle is brighter than its rim, at its place and not 4 px beside it."""
     batch = crops(in_memory(read_views([data_set])), 128, 160, generator_of(2, 0))

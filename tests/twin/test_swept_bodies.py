@@ -9,7 +9,7 @@ from recon.model import tracks
 from recon.model.circle_layout import circle_centres
 from sonotwin import config
 from sonotwin.cli import main
-from sonotwin.verbs.sweep import Config
+from sonotwin.verbs.sweep import Config, places
 from twin.filmed_sweep import PlannedSweep, plan_sweep
 from twin.swept_bodies import mean_pose
 
@@ -38,6 +38,15 @@ def test_the_needle_is_in_the_b_scan_and_tracked_to_the_noise():
     assert steps[:, 3:].std() == pytest.approx(0.03, rel=4 / np.sqrt(2 * count))
     between = tracks.at(one.truth, one.scanned.times[:-1])
     np.testing.assert_allclose(between, one.scanned.poses[:-1], atol=0.05)
+
+
+def test_it_is_said_where_one_target_may_hide_another():
+    """A patient's board between the probe's and camera 1; the usual bodies hide none, and what isn't filmed can't."""
+    before = 0.85 * planned().plan.target.poses()[0][:3, 3]
+    given = f"bodies.patient={{path: {{kind: still, place_mm: {before.round().tolist()}}}}}"
+    for fields, said in (((given, "filmed=true"), True), (("filmed=true",), False), ((given,), False)):
+        lines = [line for line, _ in places(planned(*fields))]
+        assert any("one of it and the probe may hide the other at" in line for line in lines) == said, (fields, lines)
 
 
 def test_poses_that_a_camera_has_not_in_view_are_not_found():

@@ -70,7 +70,7 @@ def misfit(frames: PhantomFrames, settings: Settings) -> float:
 def others(known: PlusPhantom) -> Iterator[tuple[str, PlusPhantom]]:
     """The same wires strung or defined otherwise, in words."""
     rows = range(len(known.wires.ends))
-    several = [(f"the diagonal of N-wire {row + 1}", [row]) for row in rows]
+    several = [(f"the diagonal of N-wire {row + 1}", [row]) for row in rows if len(rows) > 1]
     for which, restrung in [*several, ("all diagonals, as of a left-handed frame", [*rows])]:
         yield f"front and back exchanged of {which}", replace(known, wires=known.wires.restrung(restrung))
 

@@ -235,6 +235,16 @@ def test_a_table_that_was_shuffled_is_refused_as_such(rests, rng):
     judged(poses, np.arange(400) / RATE_HZ)
 
 
+def test_a_body_at_rest_is_in_any_order(rng):
+    """A tenth to a third of its poses may be flips of the tracker, which are left out with a warning."""
+    poses = np.repeat(sweep(rng, count=1), 400, axis=0)
+    poses[:, :3, 3] += 0.05 * rng.standard_normal((400, 3))
+    flipped = np.sort(rng.choice(400, 60, replace=False))
+    poses[flipped, 0, 3] += 200
+    kept, findings = judged(poses, np.arange(400) / RATE_HZ)
+    assert 40 < len(findings.rows_left_out) < 80 and np.isfinite(kept[:, 0, 0]).sum() > 300
+
+
 def test_stills_have_the_pose_of_their_moment(rng):
     """One pose a second; a still a second with the same time, up to its rounding to ms, and one between."""
     poses = sweep(rng, rate_hz=1.0, count=5)

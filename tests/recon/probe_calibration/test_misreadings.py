@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.probe_calibration import phantom_frames, plus_phantom, tank_calibration
+from recon.probe_calibration import phantom_frames, plus_phantom, point_calibration, tank_calibration
 from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.wire_dots import Dots
+from sonotwin.choices import read_rig
 from tests.recon import bscans, probe_motions, wire_rows
 
 
@@ -86,20 +87,49 @@ READ = {
     "poses in reversed order:": lambda poses: poses[::-1],
     "B-scans late by 2 of the poses:": lambda poses: np.concatenate([poses[2:], poses[:2]]),
     "B-scans early by 1 of the poses:": lambda poses: np.roll(poses, 1, axis=0),
-    "degrees read as radians": lambda poses: turned_by(poses, _as_radians),
 }
 
 
 @pytest.mark.parametrize("named", READ)
 def test_poses_that_mean_something_else_are_named(named, rig, frames):
     assert calibrate(rig, frames)
-    assert named in refusal(rig, at(frames, READ[named](frames.poses))).partition("; likely ")[2]
+    assert f"; likely {named}" in refusal(rig, at(frames, READ[named](frames.poses)))
+
+
+def test_degrees_that_were_read_as_radians_are_asked_for(rig, frames):
+    assert "are degrees read as radians?" in refusal(rig, at(frames, turned_by(frames.poses, _as_radians)))
+
+
+def test_poses_that_only_some_b_scans_have_are_shifted_among_these(rig, frames):
+    """Every third B-scan has no pose, as without tracking; late by two means two of those that have one."""
+    there = np.arange(len(frames.numbers)) % 3 > 0
+    late = frames.poses.copy()
+    late[there], late[~there] = np.roll(frames.poses[there], -2, axis=0), np.nan
+    seen = tuple(each if found else replace(each, reason="no pose") for each, found in zip(frames.seen, there, strict=True))
+    some = replace(frames.sightings.of(there), poses=late[there])
+    assert "likely B-scans late by 2 of the poses" in refusal(rig, replace(frames, seen=seen, sightings=some, poses=late))
+
+
+def test_units_that_nothing_tells_apart_are_all_named(rng):
+    """Of one point, on a bracket that isn't the design."""
+    size, probe = probe_motions.foreign_probe(rng)
+    probe = replace(probe, scale=np.full(2, 0.12))
+    seen = probe_motions.observe(probe, *point_calibration.motion(size, roll_deg=60.0), rng)
+    frames = phantom_frames.of_pairs("drawn", size, shifted_by(seen.poses, lambda places: places / 25.4), seen.pixels)
+    with pytest.raises(InputError, match="likely poses in cm or poses in inches: read so"):
+        tank_calibration.calibrate(frames, read_rig("meza2021").probe, tank_calibration.Settings(temperature_c=22))
+
+
+@pytest.mark.parametrize("fault", [np.diag([1.0, 1, -1, 1]), np.full((4, 4), np.nan), np.zeros((4, 4))])
+def test_poses_that_are_none_are_refused_as_such(fault, rig, frames):
+    """Nothing else is asked of them."""
+    assert "likely" not in refusal(rig, at(frames, frames.poses @ fault))
 
 
 @pytest.mark.parametrize("first", [10, 19])
 @pytest.mark.parametrize("pushed", [False, True])
 def test_the_frame_before_which_something_moved_is_named(first, pushed, rig, frames):
-    """By 15 mm and 8 degrees, of which robust fits leave the fewer frames out, so most are refused only if told to the point."""
+    """By 15 mm and 8 degrees: refused with the frame or the movement, or calibrated by the frames of one end, as is told."""
     step = rigid.from_rotation_vector(np.radians([5.0, -4.0, 5.0]), [9.0, -8.0, 9.0])
     poses = frames.poses.copy()
     about = rigid.transform(np.eye(3), poses[:, :3, 3].mean(axis=0))
@@ -107,16 +137,17 @@ def test_the_frame_before_which_something_moved_is_named(first, pushed, rig, fra
     try:
         found = calibrate(rig, at(frames, poses)).adjustment
     except InputError as error:
-        assert abs(int(re.search(r"was pushed, before frame (\d+)", str(error))[1]) - first) <= 1
+        told = re.search(r"were lost, at about frame (\d+)", str(error))
+        assert "the probe moved against its target" in str(error) if told is None else abs(int(told[1]) - first) <= 1
     else:
         assert found.moved is not None or found.outliers[first:].all() or found.outliers[:first].all()
 
 
-def test_frames_at_no_rest_by_any_reading_are_of_something_that_moves(rig, frames, rng):
+def test_frames_at_no_rest_by_any_reading_get_no_name(rig, frames, rng):
+    """A wrong name is worse than none."""
     hand = [rigid.from_rotation_vector(*step) for step in rng.standard_normal((len(frames.poses), 2, 3)) * [[0.1], [20.0]]]
-    assert "likely poses in the frame of another body, or of something that moves" in refusal(
-        rig, at(frames, hand @ frames.poses)
-    )
+    for poses in (hand @ frames.poses, np.roll(frames.poses, 7, axis=0)):
+        assert "likely" not in refusal(rig, at(frames, poses))
 
 
 def test_diagonals_that_run_the_other_way_are_named(rig, rng):

@@ -15,7 +15,14 @@ NOWHERE = (np.full(2, np.nan), np.full((2, 2), np.nan), np.nan)
 def test_reasons_are_put_together_by_kind():
     reasons = ["blurred: 9x3 px", None, "no echo stands out", "blurred: 8x4 px"]
     crossings = tuple(Crossing(*NOWHERE, reason) for reason in reasons)
-    frames = PhantomFrames("wires", (321, 408), Sightings(np.eye(4)[None], np.ones((1, 2))), np.array([2, 3, 5, 8]), crossings)
+    frames = PhantomFrames(
+        "wires",
+        (321, 408),
+        Sightings(np.eye(4)[None], np.ones((1, 2))),
+        np.array([2, 3, 5, 8]),
+        crossings,
+        poses=np.tile(np.eye(4), (4, 1, 1)),
+    )
     assert frames.usable.tolist() == [1]
     assert phantom_frames.rejected(frames) == {"blurred": [2, 8], "no echo stands out": [5]}
     with pytest.raises(

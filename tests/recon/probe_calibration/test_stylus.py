@@ -38,7 +38,8 @@ def calibrate(rig):
         covariance = np.diag(PIXEL_PX**2)
         seen = [NeedleEcho(pixel, covariance, 30.0) for pixel in pixels]
         sightings = stylus.sight(seen, relative.poses, relative.covariance, None, 0.0)
-        frames = PhantomFrames("stylus", rig.probe.image_size, sightings, np.arange(len(seen)), tuple(seen), 0, "stylus", tip)
+        numbers, size = np.arange(len(seen)), rig.probe.image_size
+        frames = PhantomFrames("stylus", size, sightings, numbers, tuple(seen), 0, "stylus", tip, poses=relative.poses)
         return stylus.calibrate(frames, settings, rig.probe.target_from_image.matrix())
 
     return by
@@ -99,7 +100,7 @@ def test_noise_of_the_stylus_counts_at_another_lag_too(led, rig, rng):
     numbers, size = np.arange(len(pixels)), rig.probe.image_size
     sweep = SequenceSweep("stylus", size, numbers, 0.1 * numbers, relative.poses, lambda: iter(()))
     seen = tuple(NeedleEcho(pixel, np.diag(PIXEL_PX**2), 30.0) for pixel in pixels)
-    frames = PhantomFrames("stylus", size, None, numbers, seen, 0, "stylus")
+    frames = PhantomFrames("stylus", size, None, numbers, seen, 0, "stylus", poses=relative.poses)
     found = probe_step.at_lag(frames, sweep, 0.0, 0.0, 0.0, KNOWN.noise).sightings.pose_covariance
     np.testing.assert_allclose(found, KNOWN.noise.from_body(relative.poses), atol=1e-12)
 

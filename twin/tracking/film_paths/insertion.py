@@ -20,7 +20,7 @@ from twin.tracking.views_of_target import covers, in_views
 Array = NDArray[np.float64]
 
 STEPS = 96  # of a round, between which it is smooth
-# tried one after the other, until all cameras see the target: in the plane, then across it
+# tried one after the other, until all cameras see the target, and it covers no other: in the plane, then across it
 HEADINGS_DEG = (0.0, 180.0, *(float(way) for off in range(15, 90, 15) for way in (off, -off, 180 - off, off - 180)), 90.0, -90.0)
 ANGLES_DEG = (35.0, 45.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0)
 ROLLS_DEG = (0.0, *(float(way) for off in range(15, 91, 15) for way in (off, -off)))
