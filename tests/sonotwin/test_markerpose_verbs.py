@@ -5,6 +5,7 @@ import io
 import shutil
 import tarfile
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,9 +15,12 @@ from recon.capture import calibration_files, stereo_frames
 from recon.capture.manifest import CAMERAS, Device
 from recon.capture.writer import new_capture
 from sonotwin.cli import main
+from tests.recon.tracking import films
 from tests.sonotwin.test_meza2021_verbs import COUNT, SIZE, contents, noise, optics
 from tests.trainers.conftest import write_set
 from trainers import architectures, export
+from trainers.network_metrics import decode
+from trainers.shard_reader import PATCH, VIEW
 
 STATE = {"published_detector": "detector.pt", "published_segmenter": "segmenter.pt"}
 
@@ -125,3 +129,31 @@ def test_bad_examples_are_one_line(film, tmp_path, capsys, spoil, complaint):
     assert main(["import", "layout=markerpose", f"folder={theirs}", f"out={tmp_path / 'back'}"]) == 2
     said = capsys.readouterr().err.splitlines()
     assert complaint in said[-1] and said[-1].startswith("sonotwin: ") and not (tmp_path / "back").exists()
+
+
+def test_shipped_networks_find_the_target(rig, tmp_path):
+    """In drawn frames, as none that they were trained with: places to 3 px of the view, which circle is c2, and middles of masks.
+
+    c0 and c1 are told by their turn about c2 in the published program.
+    """
+    with new_capture(tmp_path / "capture", "rig") as made:
+        made.add_calibration(optics())
+    assert main(["export", f"capture={tmp_path / 'capture'}", "networks=shipped", f"out={tmp_path / 'theirs'}"]) == 0
+    detector, segmenter = (architectures.network(name, circles=3) for name in STATE)
+    for network, file in ((detector, "superpoint.pt"), (segmenter, "ellipsegnet.pt")):
+        network.load_state_dict(torch.load(tmp_path / "theirs" / file, weights_only=True), strict=True)
+        network.eval()
+    poses = films.places(COUNT)
+    for pose, frames in zip(poses, films.draw(rig, poses, np.random.default_rng(4)), strict=True):
+        for frame, centres in zip(frames, films.centres(rig, pose), strict=True):
+            view = torch.from_numpy(cv2.resize(frame, VIEW).astype(np.float32) / 255)
+            patches = [cv2.getRectSubPix(frame, (PATCH, PATCH), tuple(centre)) for centre in centres.tolist()]
+            with torch.no_grad():
+                found = decode(*detector(view[None, None]), most=3)[0]
+                masks = segmenter(torch.from_numpy(np.float32(patches) / 255)[:, None])[:, 0].numpy() > 0
+            expected = centres / np.array(frame.shape[::-1]) * VIEW
+            nearest = np.linalg.norm(found.places[:, None] - expected, axis=-1)
+            assert sorted(nearest.argmin(axis=1)) == [0, 1, 2] and nearest.min(axis=1).max() < 3
+            assert found.identities[nearest[:, 2].argmin()] == 2
+            middles = np.array([np.argwhere(mask).mean(axis=0) for mask in masks])
+            assert np.abs(middles - (PATCH - 1) / 2).max() < 0.5
