@@ -21,19 +21,19 @@ Array = NDArray[np.float64]
 Misfit = Callable[[PhantomFrames], float]
 
 MOST_TRIED = 24  # frames, evenly over all, and places of a change
-LESS, AS_WELL = 1 / 8, 1.5  # of the misfit as given, up to which a reading may be right: of frames that contradict, and of others
+LESS, AS_WELL = 1 / 8, 1.5  # of the misfit as given, up to which a reading may be right: of frames that don't agree, and that do
 MOST_LATE = 3  # frames
 FEWEST_AFTER = 3  # frames of those that don't agree with the others
 FACES_DEG = 150.0  # between the normals of a target that cameras see from its front, at most
 
 
-def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Array, agree: bool) -> str:
+def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Array, how: probe_checks.How) -> str:
     """Name the likely mistake in frames that a phantom's `calibrate` refuses as misread, to be added to that; or nothing.
 
     Parameters
     ----------
     kind, settings, expected : of the phantom, with its `misfit`, and as its `calibrate` takes them
-    agree : of `probe_checks.Misread`
+    how : of `probe_checks.Misread`
     """
 
     def misfit(some: PhantomFrames) -> float:
@@ -42,7 +42,7 @@ def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Ar
         return kind.misfit(_some(some, _evenly(0, len(some.usable) - 1)), settings)
 
     here = misfit(frames)
-    most, likely = (AS_WELL if agree else LESS) * here, []
+    most, likely = (AS_WELL if how == "agree" else LESS) * here, []
     for meaning, other in _readings(frames, kind):
         if (value := misfit(other)) > most:
             continue
@@ -60,7 +60,7 @@ def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Ar
         }
         meant = min(away, key=lambda meaning: away[meaning]) if away else " or ".join(meaning for _, meaning, _ in best)
         return f"; likely {meant}: read so, they agree"
-    if agree:
+    if how != "contradict":
         return ""
     return _changed(frames, kind.MIN_FRAMES, LESS * here, misfit) or _faces(frames)
 

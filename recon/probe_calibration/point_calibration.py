@@ -262,7 +262,9 @@ def calibrate(
     except InputError as error:
         unsure = "" if sightings.pose_by_lag is None else "; the uncertainty of the lag is in it: hold still, or measure the lag"
         also = f"; {late.described}" if late is not None and late.shown else unsure
-        raise InputError(f"{error}{also}" if moved is None else f"{error}; {moved.described}") from None
+        if moved is not None:  # what moves by much may be something else
+            raise probe_checks.Misread(f"{error}; {moved.described}", how="moved") from None
+        raise InputError(f"{error}{also}") from None
     covariance[SHIFT, SHIFT] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)
     ahead = rigid.transform(np.eye(3), [0, -ahead_mm, 0])

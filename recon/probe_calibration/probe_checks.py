@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from itertools import permutations, product
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +30,16 @@ POSE_UNITS = {"m": 1e3, **UNITS}  # mm
 AXES = ("c0-c1", "c0-c2", "normal")  # of the target
 
 
+How = Literal["contradict", "agree", "moved"]
+
+
 class Misread(InputError):
     """Frames that another reading of their poses may explain."""
 
-    def __init__(self, fault: str, agree: bool = False, likely: str = "") -> None:
-        """`agree`: whether they agree, but by a probe that can't be; `likely`: the reading, in words."""
+    def __init__(self, fault: str, how: How = "contradict", likely: str = "") -> None:
+        """`how`: they contradict each other, or agree by a probe that can't be, or by a movement; `likely`: a reading, in words."""
         super().__init__(fault + likely)
-        self.fault, self.agree = fault, agree
+        self.fault, self.how = fault, how
 
 
 class _Frames(Protocol):
@@ -190,7 +193,7 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
     for name, value in zip(("sx", "sy"), calibration.scale, strict=True):
         if not SCALES[0] <= value <= SCALES[1]:
             found = f"{value:.3g} with {described(calibration)}: are the poses in mm?"
-            raise Misread(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}", agree=True)
+            raise Misread(f"calibration: {name}: expected {SCALES[0]:g} to {SCALES[1]:g} mm/px, found {found}", how="agree")
     if expected is None or near(calibration, size, expected):
         return
     off = _off_if_confused(calibration, size, expected)
@@ -200,7 +203,7 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
         close = f"found it there to {off[name][0]:.0f} deg and {off[name][1]:.0f} mm, but as if {name}"
         raise Misread(
             f"calibration: expected target_from_image near its design, {close}; if it is right, give {described(calibration)}",
-            agree=True,
+            how="agree",
         )
 
 

@@ -229,8 +229,8 @@ def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.f
     try:
         return kind.calibrate(frames, settings, expected)
     except probe_checks.Misread as error:
-        likely = misreadings.explain(frames, kind, settings, expected, error.agree) if hasattr(kind, "misfit") else ""
-        raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.agree, likely) from None
+        likely = misreadings.explain(frames, kind, settings, expected, error.how) if hasattr(kind, "misfit") else ""
+        raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.how, likely) from None
 
 
 def _design_sy(found: ProbeCalibration, size: tuple[int, int], design: Probe) -> float:
