@@ -37,7 +37,7 @@ class Misread(InputError):
     """Frames that another reading of their poses may explain."""
 
     def __init__(self, fault: str, how: How = "contradict", likely: str = "") -> None:
-        """`how`: they contradict each other, or agree by a probe that can't be, or by a movement; `likely`: a reading, in words."""
+        """`how`: they contradict each other, agree by an impossible probe, or by a movement; `likely`: the reading, in words."""
         super().__init__(fault + likely)
         self.fault, self.how = fault, how
 
