@@ -12,7 +12,14 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import Rig
-from recon.probe_calibration import point_calibration, repeatability, sound_in_water, wires
+from recon.probe_calibration import (
+    phantom_frames,
+    point_calibration,
+    repeatability,
+    sound_in_water,
+    tank_calibration,
+    wires,
+)
 from recon.probe_calibration.point_calibration import Adjustment, Noise, Sightings
 from scenes.acoustics import TISSUES
 from scenes.kinds import crosswire
@@ -205,7 +212,8 @@ def refusals(setup: Setup, frames: Frames | None = None) -> Figures:
     def shifted() -> object:
         poses = tracked(rig, block.poses, rng)
         poses[:, :3, 3] *= [1, 1, -1]
-        return point_calibration.calibrate(replace(block, poses=poses), rig.probe.image_size)
+        pairs = phantom_frames.of_pairs("crossings", rig.probe.image_size, poses, block.pixels)
+        return tank_calibration.calibrate(pairs, rig.probe, tank_calibration.Settings(temperature_c=TEMPERATURE_C))
 
     cases: dict[str, tuple[Callable[[], object], str]] = {
         "planar": (lambda: calibrated(rig, planar(setup), rng), "planar motion"),
