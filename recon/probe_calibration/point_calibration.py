@@ -60,6 +60,7 @@ MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
 MAX_FACTOR = 8.0  # measured over assumed noise, of frames of one point at rest
 MAX_RMS_MM = 3.0  # of their residuals, for any lever; Meza et al. 2021 have 0.423 in each coordinate
 NAMED = 5  # frames, of a refusal
+MOST_MOVED_DEG, MOST_MOVED_MM = 20.0, 30.0  # of a movement that a calibration allows for: beyond, it is something else
 MIN_INLIERS = 0.5  # of the frames
 REACH = (0.43, 0.40)  # of the crossing from the middle, of the image's width and height: spots stay whole and clear of the face
 ROCK = 0.6  # greatest part of a tilt about the image's normal, by which wires are seen edge-on
@@ -246,6 +247,9 @@ def calibrate(
     used = UNKNOWNS["wire"].stop if sightings.beside is None else len(UNKNOWNS)
     equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
     moved = movement.find(equations, inliers)
+    if moved is not None and (moved.turn_deg > MOST_MOVED_DEG or moved.shift_mm > MOST_MOVED_MM):
+        found = f"that {moved.described}"
+        raise probe_checks.Misread(f"sightings: expected frames of one point at rest, found {found}", how="moved")
     solved, inliers = inliers, inliers if moved is None else moved.frames
     alike = movement.alike(slopes[inliers][..., :used], left[inliers], equations.known) if moved is None else moved.alike
     step, covariance = movement.average(equations, solved, inliers, factor, alike)

@@ -27,6 +27,7 @@ ALIKE_DEG, ALIKE_MM = 30.0, 30.0  # from the design but for axes or units: anoth
 DEPTHS = (10.0, 400.0)  # mm, of ordinary images
 UNITS = {"cm": 10.0, "inches": 25.4}  # mm; metres and micrometres leave SCALES
 POSE_UNITS = {"m": 1e3, **UNITS}  # mm
+_IN_UNIT = "the poses are in {}"
 AXES = ("c0-c1", "c0-c2", "normal")  # of the target
 
 
@@ -201,10 +202,14 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
     if alike:
         name = min(alike, key=lambda each: alike[each])
         close = f"found it there to {off[name][0]:.0f} deg and {off[name][1]:.0f} mm, but as if {name}"
-        raise Misread(
-            f"calibration: expected target_from_image near its design, {close}; if it is right, give {described(calibration)}",
-            how="agree",
+        fault, way = (
+            f"calibration: expected target_from_image near its design, {close}",
+            f"if it is right, give {described(calibration)}",
         )
+        for unit, length in UNITS.items():
+            if name == _IN_UNIT.format(unit):
+                raise InputError(f"{fault}: multiply their translations by {length:g}; {way}")
+        raise Misread(f"{fault}; {way}", how="agree")
 
 
 def scanner_scale(implied: float, calibration: ProbeCalibration) -> None:
@@ -327,7 +332,7 @@ def _off_if_confused(calibration: ProbeCalibration, size: Size, expected: Array)
         )
     for unit, length in UNITS.items():
         pose = rigid.transform(turn, calibration.target_from_image[:3, 3] * length)
-        off[f"the poses are in {unit}"] = off_design(ProbeCalibration(pose, calibration.scale * length), size, expected)
+        off[_IN_UNIT.format(unit)] = off_design(ProbeCalibration(pose, calibration.scale * length), size, expected)
     return off
 
 

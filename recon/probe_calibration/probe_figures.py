@@ -18,6 +18,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
+MANY = 0.25  # of the frames: so many outliers may agree with each other
 EDGE = 3  # frames at an end, of which it is said that all are outliers
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
@@ -115,6 +116,9 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
         yield f"warning     {doubt}"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
+    if (share := float(found.outliers.mean())) > MANY:
+        cause = "something moved, or what was found is something else"
+        yield f"warning     {100 * share:.0f} % of the frames are outliers: {cause}, and the result may be of neither part"
     for which, outliers, there in (("last", found.outliers[::-1], "before"), ("first", found.outliers, "after")):
         if (count := int(outliers.argmin())) >= EDGE:
             slipped = f"if the bracket slipped {there} them, the result is of {there}"

@@ -431,7 +431,9 @@ def test_poses_in_cm_are_told_by_the_brackets_length(probe, frames, rng):
     sightings = observe(probe, *frames, rng)
     in_cm = Sightings(shifts(sightings.poses, np.eye(4) / 10), sightings.pixels)
     small = Noise(ANGLE_DEG, POSITION_MM / 10, PIXEL_PX, SLICE_MM / 10)
-    with pytest.raises(InputError, match=r"as if the poses are in cm; if it is right, give rig.probe") as raised:
+    with pytest.raises(
+        InputError, match=r"as if the poses are in cm: multiply their translations by 10; if it is right, give rig.probe"
+    ) as raised:
         calibrate(in_cm, SIZE, small, probe.target_from_image)
     assert "\n" not in str(raised.value)
 
