@@ -11,7 +11,7 @@ from recon.freehand.sequence_sweep import SequenceSweep
 from recon.model import tracks
 from recon.model.tip import Tip
 from recon.model.tracks import Track
-from recon.probe_calibration import needle_echo, point_calibration, repeatability
+from recon.probe_calibration import needle_echo, point_calibration, repeatability, tank_calibration
 from recon.probe_calibration.needle_echo import NeedleEcho
 from recon.probe_calibration.phantom_frames import PhantomFrames
 from recon.probe_calibration.phantoms import stylus
@@ -21,8 +21,8 @@ from tests.recon import needle_scans
 from tests.recon.probe_motions import true_probe
 from tests.recon.stylus_motions import PIXEL_PX, known_tip, lead, tracked
 
-KNOWN = Settings(phantom="stylus", body="stylus", tip="tip.yaml", tip_radius_sigma_mm=0.0)
-FREE = Settings(phantom="stylus", body="stylus", tip_radius_sigma_mm=0.0)
+KNOWN = Settings(phantom="stylus", body="stylus", tip="tip.yaml", tip_radius_sigma_mm=0.0, temperature_c=22)
+FREE = Settings(phantom="stylus", body="stylus", tip_radius_sigma_mm=0.0, temperature_c=22)
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def calibrate(rig):
         sightings = stylus.sight(seen, relative.poses, relative.covariance, None, 0.0)
         numbers, size = np.arange(len(seen)), rig.probe.image_size
         frames = PhantomFrames("stylus", size, sightings, numbers, tuple(seen), 0, "stylus", tip, poses=relative.poses)
-        return stylus.calibrate(frames, settings, rig.probe.target_from_image.matrix())
+        return tank_calibration.calibrate(frames, rig.probe, settings).adjustment
 
     return by
 
@@ -154,8 +154,8 @@ def _metres(poses):
     (lambda poses, pixels: (poses, [320, 0] + pixels * [-1, 1]), "but as if the image is mirrored left to right"),
     (lambda poses, pixels: (poses, [0, 407] + pixels * [1, -1]), "but as if the image is upside down"),
     (lambda poses, pixels: (_metres(poses), pixels), "are the poses in mm"),
-    (lambda poses, pixels: (np.linalg.inv(poses), pixels), "found target_from_world, the inverse"),
-    (lambda poses, pixels: (np.roll(poses, 2, axis=0), pixels), "frames of one point at rest, found"),
+    (lambda poses, pixels: (np.linalg.inv(poses), pixels), "likely poses of target_from_world, the inverse"),
+    (lambda poses, pixels: (np.roll(poses, 2, axis=0), pixels), "likely B-scans (late|early) by 2 of the poses"),
 ])  # fmt: skip
 def test_other_meanings_of_poses_and_images_are_refused(calibrate, led, rng, change, named):
     relative, pixels = led(rng)
