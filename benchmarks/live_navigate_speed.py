@@ -81,7 +81,7 @@ def navigated(setup: Setup) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         fields = ["scene=breast", "path=raster", "path.strokes=1"]
         capture = recorded(Path(folder), fields)
-        return watched(load("navigate", [f"capture={capture}", f"lag_s={LAG_S}"], navigate.Config), MASSES)
+        return watched(load("navigate", [f"capture={capture}", f"lag_s={LAG_S}"], navigate.Config))
 
 
 def navigated_with_tools(setup: Setup) -> Figures:
@@ -97,7 +97,7 @@ def navigated_with_tools(setup: Setup) -> Figures:
         given = [f"tips.{NEEDLE}={folder / 'tip.yaml'}", f"reference={folder / 'reference.csv'}"]
         config = load("navigate", [f"capture={capture}", f"lag_s={LAG_S}", "rig=three_bodies", *given], navigate.Config)
         kept: list[Moment] = []
-        figures = watched(config, MASSES, kept)
+        figures = watched(config, kept)
         timeline = playback.timeline_of(playback.read_recording(capture))
         off = [each for moment in kept for each in _off(moment, timeline, true[NEEDLE], tip_mm)]
     return figures | {
@@ -106,13 +106,13 @@ def navigated_with_tools(setup: Setup) -> Figures:
     }
 
 
-def watched(config: navigate.Config, centres: dict[str, tuple[float, float, float]], kept: list[Moment] | None = None) -> Figures:
+def watched(config: navigate.Config, kept: list[Moment] | None = None) -> Figures:
     """Navigate for some seconds with a page that somebody looks at, and keep the moments of those that count."""
     sources = navigate.sources_of(config)
     tracker = navigate.tracker_of(config, sources.sizes, sources.bits)
     probe, tools, reference = navigate.probe_of(config), navigate.tools_of(config), navigate.reference_of(config)
     scene = still_scene.read_scene(None, None, config.rig.target, probe, sources.width, tools=tools)
-    masses = {name: trimesh.creation.icosphere(4, MASS_MM).apply_translation(centre) for name, centre in centres.items()}
+    masses = {name: trimesh.creation.icosphere(4, MASS_MM).apply_translation(centre) for name, centre in MASSES.items()}
     surfaces = {name: tool_distances.surface_of(mass.vertices, mass.faces) for name, mass in masses.items()} if tools else {}
     view = BrowserView(scene, PORT)
     warm_up(tracker)

@@ -169,9 +169,8 @@ def named(found: Sequence[Outcome], tasks: Sequence[Task] = TASKS) -> tuple[int,
     """Number of the mistakes that a refusal or a warning names by their cause, and of all that aren't harmless."""
     causes = {(task.name, mistake.what): mistake.cause for task in tasks for mistake in task.mistakes}
     harmful = [one for one in found if one.outcome != "harmless"]
-    return sum(bool(one.said and re.search(causes.get((one.verb, one.what), "$."), one.said, re.I)) for one in harmful), len(
-        harmful
-    )
+    told = [one for one in harmful if one.said and re.search(causes.get((one.verb, one.what), "$."), one.said, re.I)]
+    return len(told), len(harmful)
 
 
 def table(found: Sequence[Outcome]) -> list[str]:

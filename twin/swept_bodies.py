@@ -50,8 +50,8 @@ class SweptBody:
 
     def covers(self, target: Target, poses: Array, rig: Rig) -> NDArray[np.bool_]:
         """Whether its target and another one at poses : (m, 4, 4) lie before each other for a camera : (m,), as of `covers`."""
-        pairs = zip(self.truth.poses, poses, strict=True)
-        return np.array([covers(own, self.target, other, target, cameras_of(rig)) for own, other in pairs])
+        pairs, cameras = zip(self.truth.poses, poses, strict=True), cameras_of(rig)
+        return np.array([covers(own, self.target, other, target, cameras) for own, other in pairs])
 
     def in_slice(self, world_from_image: Array, rig: Rig) -> NDArray[np.bool_] | None:
         """Whether its tip lies in the B-scans : (n,) of poses (n, 4, 4), within their slice; None of a body without a tip."""

@@ -248,8 +248,8 @@ def calibrate(
     equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
     moved = movement.find(equations, inliers)
     if moved is not None and (moved.turn_deg > MOST_MOVED_DEG or moved.shift_mm > MOST_MOVED_MM):
-        found = f"that {moved.described}"
-        raise probe_checks.Misread(f"sightings: expected frames of one point at rest, found {found}", how="moved")
+        fault = f"sightings: expected frames of one point at rest, found that {moved.described}"
+        raise probe_checks.Misread(fault, how="moved")
     solved, inliers = inliers, inliers if moved is None else moved.frames
     alike = movement.alike(slopes[inliers][..., :used], left[inliers], equations.known) if moved is None else moved.alike
     step, covariance = movement.average(equations, solved, inliers, factor, alike)

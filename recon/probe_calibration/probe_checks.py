@@ -202,10 +202,8 @@ def outcome(calibration: ProbeCalibration, size: Size, expected: Array | None) -
     if alike:
         name = min(alike, key=lambda each: alike[each])
         close = f"found it there to {off[name][0]:.0f} deg and {off[name][1]:.0f} mm, but as if {name}"
-        fault, way = (
-            f"calibration: expected target_from_image near its design, {close}",
-            f"if it is right, give {described(calibration)}",
-        )
+        fault = f"calibration: expected target_from_image near its design, {close}"
+        way = f"if it is right, give {described(calibration)}"
         for unit, length in UNITS.items():
             if name == _IN_UNIT.format(unit):
                 raise InputError(f"{fault}: multiply their translations by {length:g}; {way}")

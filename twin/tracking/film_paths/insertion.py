@@ -101,14 +101,13 @@ class Kind(FilmPath):
             for headings in (tried[0][:2], tried[0][2:])
             for angle, roll, heading in product(*tried[1:], headings)
         ]
-        seen = []
+        seen, others = [], [(pose, other) for other, places in aimed.others for pose in places]
         for way in ways if aimed.cameras else []:
             turn, ends = way._held(eyes, aimed.line_mm, aimed.world_from_face), way.line(aimed.world_from_face)[:2]
             poses = np.stack([rigid.transform(turn, end - turn @ aimed.line_mm[1]) for end in ends])
             if not in_views(poses, target, aimed.cameras, MARGIN, MOST_DEG).all():
                 continue
             seen.append(way)
-            others = [(pose, other) for other, places in aimed.others for pose in places]
             if not any(covers(own, target, pose, other, aimed.cameras) for own in poses for pose, other in others):
                 return way
         return (seen or ways)[0]
