@@ -24,6 +24,7 @@ MOST_TRIED = 24  # frames, evenly over all, and places of a change
 LESS, AS_WELL = 1 / 8, 1.5  # of the misfit as given, up to which a reading may be right: of frames that don't agree, and that do
 MOST_LATE = 3  # frames
 FEWEST_AFTER = 3  # frames of those that don't agree with the others
+CHANGED = "a bracket that slipped, a phantom that was pushed, another depth setting, or B-scans that were lost"
 FACES_DEG = 150.0  # between the normals of a target that cameras see from its front, at most
 
 
@@ -65,6 +66,25 @@ def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Ar
     return _changed(frames, kind.MIN_FRAMES, LESS * here, misfit) or _faces(frames)
 
 
+def two_parts(frames: PhantomFrames, outliers: NDArray[np.bool_], kind: ModuleType, settings: Any) -> str:
+    """Say between which frames something changed, if those before it agree, and those after it, but never both; or nothing.
+
+    Frames of both parts may agree by a wrong scale, others of both being outliers: then the result is of neither part. It is of
+    one part, and right there, if all of the other are outliers : (n,) of the usable frames.
+    """
+    if outliers.sum() < FEWEST_AFTER:
+        return ""
+    here, numbers = kind.misfit(frames, settings), frames.numbers[frames.usable]
+    for first in _evenly(kind.MIN_FRAMES, len(frames.usable) - kind.MIN_FRAMES).tolist():
+        parts = np.split(np.arange(len(frames.usable)), [first])
+        if any(outliers[part].all() for part in parts):
+            return ""
+        if max(kind.misfit(_some(frames, part), settings) for part in parts) < LESS * here:
+            ends = [f"{numbers[part[0]]} to {numbers[part[-1]]}" for part in parts]
+            return f"that frames {ends[0]} do, and so do {ends[1]}, but not the ones with the others: {CHANGED}"
+    return ""
+
+
 def _readings(frames: PhantomFrames, kind: ModuleType) -> Iterator[tuple[str, PhantomFrames]]:
     """Common mistakes, each with the frames as they would be without."""
     poses = frames.sightings.poses
@@ -90,9 +110,8 @@ def _changed(frames: PhantomFrames, least: int, most: float, misfit: Misfit) -> 
     for size in _evenly(max(least, count // 2), count - FEWEST_AFTER)[::-1].tolist():
         for first, kept in ((size, np.arange(size)), (count - size, np.arange(count - size, count))):
             if misfit(_some(frames, kept)) < most:
-                cause = "a bracket that slipped, a phantom that was pushed, another depth setting, or B-scans that were lost"
                 agree = f"frames {numbers[kept[0]]} to {numbers[kept[-1]]} agree with one another, but not with the others"
-                return f"; {agree}: {cause}, at about frame {numbers[first]}"
+                return f"; {agree}: {CHANGED}, at about frame {numbers[first]}"
     return ""
 
 

@@ -224,13 +224,16 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
 
 
 def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.float64]) -> Adjusted:
-    """As the phantom's `calibrate`, or the likely mistake in what it refuses."""
+    """As the phantom's `calibrate`, or the likely mistake in what it refuses, or two parts of which one alone can be right."""
     kind = registry.kind(PHANTOMS, frames.phantom)
     try:
-        return kind.calibrate(frames, settings, expected)
+        found = kind.calibrate(frames, settings, expected)
     except probe_checks.Misread as error:
         likely = misreadings.explain(frames, kind, settings, expected, error.how) if hasattr(kind, "misfit") else ""
         raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.how, likely) from None
+    if hasattr(kind, "misfit") and (parts := misreadings.two_parts(frames, found.outliers, kind, settings)):
+        raise InputError(f"sightings: expected frames that agree with one another, found {parts}")
+    return found
 
 
 def _design_sy(found: ProbeCalibration, size: tuple[int, int], design: Probe) -> float:
