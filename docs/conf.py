@@ -11,6 +11,7 @@ from pathlib import Path
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
+from sphinx.domains.python import ObjectEntry, PythonDomain
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]  # the packages beside these pages, whatever is installed
@@ -109,10 +110,35 @@ def block_math(translator: nodes.NodeVisitor, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
+class ShortNames(PythonDomain):
+    """Python's domain, which looks for a name among those that end alike: among all of them it took half of the build."""
+
+    _by_end: dict[str, dict[str, ObjectEntry]] | None = None
+    _alike: dict[str, ObjectEntry] | None = None
+
+    @property
+    def objects(self) -> dict[str, ObjectEntry]:
+        """All names, or while one is looked for, those that end as it does."""
+        return super().objects if self._alike is None else self._alike
+
+    def find_obj(self, env: object, modname: str, classname: str, name: str, *more: object) -> list[tuple[str, ObjectEntry]]:
+        """As Sphinx' own."""
+        if self._by_end is None:  # pages are read before the first name is looked for
+            self._by_end = {}
+            for whole, entry in self.objects.items():
+                self._by_end.setdefault(whole.rpartition(".")[2], {})[whole] = entry
+        self._alike = self._by_end.get(name.removesuffix("()").rpartition(".")[2], {})
+        try:
+            return super().find_obj(env, modname, classname, name, *more)
+        finally:
+            self._alike = None
+
+
 def setup(app: Sphinx) -> None:
     """Connect the steps above."""
     import site_pages  # of this folder
 
+    app.add_domain(ShortNames, override=True)
     app.add_directive("accuracy-rows", site_pages.AccuracyRows)
     app.add_directive("rooms", site_pages.Rooms)
     app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
