@@ -60,15 +60,11 @@ def centres(errors: Sequence[Located]) -> Figures:
 
 
 def poses_at_rest(setup: Setup) -> Figures:
-    """Errors of centres and poses, static and lit, over the working volume; whether covariances hold; the published recipe's."""
+    """Errors of centres and poses, static and lit, over the working volume; whether covariances hold."""
     setup, known = exactly_printed(setup), nets.load(kind=setup.rig.target.kind)
     sample = list(tracking_frames.study(setup, SEED, COUNT, LIT_DN, 0.0, FINE))
     errors = [located(take, given, setup.rig.target, known) for take, given in sample]
-    recipe = [pose_errors(take, published_recipe(known)(cameras_of(take), given.views)) for take, given in sample]
     shift, turn, misfit = (np.array([getattr(one, name) for one in errors]) for name in ("shift_mm", "turn_deg", "misfit"))
-    theirs = np.array([(np.nan, np.nan) if one is None else one for one in recipe])
-    both = np.isfinite(shift) & np.isfinite(theirs[:, 0])
-    ratio = np.median(theirs[both], axis=0) / [np.median(shift[both]), np.median(turn[both])]
     misfit = misfit[np.isfinite(misfit)]
     return centres(errors) | {
         "poses": len(sample),
@@ -79,10 +75,21 @@ def poses_at_rest(setup: Setup) -> Figures:
         "found_percent": 100 * np.isfinite(shift).mean(),
         "squared": misfit.mean(),
         "inside_percent": 100 * np.mean(misfit < chi2.ppf(0.95, 6)),
-        "both": both.sum(),
-        "recipe_shift": ratio[0],
-        "recipe_turn": ratio[1],
     }
+
+
+def beside_recipe(setup: Setup, white_dn: float, blur_px: float) -> Figures:
+    """Poses that the published recipe finds with the same networks in the same frames, and its errors over ours."""
+    setup, known = exactly_printed(setup), nets.load(kind=setup.rig.target.kind)
+    sample = list(tracking_frames.study(setup, SEED, COUNT, white_dn, blur_px))
+    results = [located(take, given, setup.rig.target, known) for take, given in sample]
+    recipe = [pose_errors(take, published_recipe(known)(cameras_of(take), given.views)) for take, given in sample]
+    ours = np.array([(one.shift_mm, one.turn_deg) for one in results])
+    theirs = np.array([(np.nan, np.nan) if one is None else one for one in recipe])
+    both = np.isfinite(ours[:, 0]) & np.isfinite(theirs[:, 0])
+    shift, turn = np.median(theirs[both], axis=0) / np.median(ours[both], axis=0)
+    found = {f"{name}_percent": 100 * np.isfinite(each[:, 0]).mean() for name, each in (("found", ours), ("recipe", theirs))}
+    return {"both": both.sum(), "recipe_shift": shift, "recipe_turn": turn, "shift_mm": np.median(ours[both, 0])} | found
 
 
 def located(take: Take, given: Frames, target: Target, networks: Networks) -> Located:
