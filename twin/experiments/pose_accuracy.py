@@ -88,8 +88,10 @@ def beside_recipe(setup: Setup, white_dn: float, blur_px: float) -> Figures:
     theirs = np.array([(np.nan, np.nan) if one is None else one for one in recipe])
     both = np.isfinite(ours[:, 0]) & np.isfinite(theirs[:, 0])
     shift, turn = np.median(theirs[both], axis=0) / np.median(ours[both], axis=0)
-    found = {f"{name}_percent": 100 * np.isfinite(each[:, 0]).mean() for name, each in (("found", ours), ("recipe", theirs))}
-    return {"both": both.sum(), "recipe_shift": shift, "recipe_turn": turn, "shift_mm": np.median(ours[both, 0])} | found
+    figures = {"both": both.sum(), "shift_ratio": shift, "turn_ratio": turn}
+    for name, errors in (("ours", ours), ("recipe", theirs)):
+        figures |= {f"{name}_percent": 100 * np.isfinite(errors[:, 0]).mean(), f"{name}_mm": np.nanmedian(errors[:, 0])}
+    return figures
 
 
 def located(take: Take, given: Frames, target: Target, networks: Networks) -> Located:
