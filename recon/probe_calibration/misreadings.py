@@ -24,6 +24,8 @@ MOST_TRIED = 24  # frames, evenly over all, and places of a change
 LESS, AS_WELL = 1 / 8, 1.5  # of the misfit as given, up to which a reading may be right: of frames that don't agree, and that do
 MOST_LATE = 3  # frames
 FEWEST_AFTER = 3  # frames of those that don't agree with the others
+MANY = 0.2  # of the frames: so many outliers may agree with each other
+OF_OTHER = 0.9  # of the frames of one part, that are outliers where a result is of the other part
 CHANGED = "a bracket that slipped, a phantom that was pushed, another depth setting, or B-scans that were lost"
 FACES_DEG = 150.0  # between the normals of a target that cameras see from its front, at most
 
@@ -69,20 +71,21 @@ def explain(frames: PhantomFrames, kind: ModuleType, settings: Any, expected: Ar
 def two_parts(frames: PhantomFrames, outliers: NDArray[np.bool_], kind: ModuleType, settings: Any) -> str:
     """Say between which frames something changed, if those before it agree, and those after it, but never both; or nothing.
 
-    Frames of both parts may agree by a wrong scale, others of both being outliers: then the result is of neither part. It is of
-    one part, and right there, if all of the other are outliers : (n,) of the usable frames.
+    Frames of both parts may agree by a wrong scale, others of both being outliers : (n,) of the usable frames: then the result is
+    of neither part. It is of one part, and right there, if the other's are outliers.
     """
-    if outliers.sum() < FEWEST_AFTER:
+    count, most = len(outliers), LESS * kind.misfit(frames, settings)
+    best, agree = 0, most
+    for first in _evenly(kind.MIN_FRAMES, count - kind.MIN_FRAMES).tolist() if count >= 2 * kind.MIN_FRAMES else ():
+        worst = 0.0
+        for part in (np.arange(first), np.arange(first, count)):
+            worst = max(worst, kind.misfit(_some(frames, part), settings) if worst < agree else np.inf)
+        best, agree = (first, worst) if worst < agree else (best, agree)
+    if not best or max(outliers[:best].mean(), outliers[best:].mean()) > OF_OTHER:
         return ""
-    here, numbers = kind.misfit(frames, settings), frames.numbers[frames.usable]
-    for first in _evenly(kind.MIN_FRAMES, len(frames.usable) - kind.MIN_FRAMES).tolist():
-        parts = np.split(np.arange(len(frames.usable)), [first])
-        if any(outliers[part].all() for part in parts):
-            return ""
-        if max(kind.misfit(_some(frames, part), settings) for part in parts) < LESS * here:
-            ends = [f"{numbers[part[0]]} to {numbers[part[-1]]}" for part in parts]
-            return f"that frames {ends[0]} do, and so do {ends[1]}, but not the ones with the others: {CHANGED}"
-    return ""
+    numbers = frames.numbers[frames.usable]
+    ends = f"frames {numbers[0]} to {numbers[best - 1]} agree with one another, and so do {numbers[best]} to {numbers[-1]}"
+    return f"; {ends}, but not with the others: {CHANGED}, at about frame {numbers[best]}"
 
 
 def _readings(frames: PhantomFrames, kind: ModuleType) -> Iterator[tuple[str, PhantomFrames]]:

@@ -12,13 +12,20 @@ from recon.files.metrics import Metrics
 from recon.geometry import rigid
 from recon.model.probe import NAMES, ProbeCalibration
 from recon.model.rig import Probe
-from recon.probe_calibration import movement, phantom_frames, point_calibration, probe_checks, repeatability, sound_in_water
+from recon.probe_calibration import (
+    misreadings,
+    movement,
+    phantom_frames,
+    point_calibration,
+    probe_checks,
+    repeatability,
+    sound_in_water,
+)
 from recon.probe_calibration.phantom_frames import PHANTOMS, Adjusted, PhantomFrames
-from recon.probe_calibration.tank_calibration import SAME_WIDTH, Result, Settings
+from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
-MANY = 0.2  # of the frames: so many outliers may agree with each other
 EDGE = 3  # frames at an end, of which it is said that all are outliers
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
@@ -116,15 +123,15 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
         yield f"warning     {doubt}"
     corners = [figures[f"sigma_{name}_mm"] for name in FIVE_POINTS[1:]]
     centre, edge = f"{figures['sigma_centre_mm']:.3f} mm", f"{min(corners):.3f} to {max(corners):.3f} mm"
-    if (share := float(found.outliers.mean())) >= MANY:
+    if (share := float(found.outliers.mean())) >= misreadings.MANY:
         cause = "something moved, or what was found is something else"
-        yield f"warning     {100 * share:.0f} % of the frames are outliers: {cause}, and the result may be of neither part"
+        yield f"warning     {100 * share:.0f} % of the frames are outliers: {cause}"
     for which, outliers, there in (("last", found.outliers[::-1], "before"), ("first", found.outliers, "after")):
         if (count := int(outliers.argmin())) >= EDGE:
             slipped = f"if the bracket slipped {there} them, the result is of {there}"
             yield f"warning     the {which} {count} frames are outliers: {slipped}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
-    yield from _describe_sound(figures, frames.size, design, settings)
+    yield from _describe_sound(figures, result.off_scale, design, settings)
 
 
 def describe_comparison(figures: Metrics, earlier: object) -> str:
@@ -137,12 +144,12 @@ def describe_comparison(figures: Metrics, earlier: object) -> str:
     return f"warning     the probe moved against its target by {by} since {earlier}: a bent bracket, or a target that slipped"
 
 
-def _describe_sound(figures: Metrics, size: tuple[int, int], design: Probe, settings: Settings) -> Iterator[str]:
+def _describe_sound(figures: Metrics, off_scale: bool, design: Probe, settings: Settings) -> Iterator[str]:
     speed, sigma = figures["implied_speed_m_per_s"], figures["implied_speed_sigma_m_per_s"]
     shown_sy, assumed, in_water = figures["scanner_sy_mm_per_px"], settings.assumed_speed, figures["water_speed_m_per_s"]
-    ratio = figures["sx_mm_per_px"] / design.scale_mm_per_px[0]
-    if np.isnan(shown_sy) and size == design.image_size and abs(ratio - 1) > SAME_WIDTH:
-        likely = "another depth setting or scanner, or the lengths of the poses?"
+    if off_scale:
+        ratio = figures["sx_mm_per_px"] / design.scale_mm_per_px[0]
+        likely = "another depth setting or scanner, whose [sx,sy] it takes, or the lengths of the poses?"
         yield f"warning     sy isn't checked, as pixels are {ratio:.3f} times as wide as rig.probe.scale_mm_per_px: {likely}"
     elif np.isnan(shown_sy):
         yield "sound       not checked by sy, as the scanner's mm/px are unknown; rig.probe.scale_mm_per_px=[sx,sy] does"

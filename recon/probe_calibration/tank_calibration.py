@@ -182,6 +182,7 @@ class Result:
     calibration: ProbeCalibration  # for the medium of later sweeps
     shown_sy: float  # mm/px by which the scanner draws depths; NaN if unknown
     implied_speed: tuple[float, float]  # of sound in the tank by both sy, m/s, and its standard deviation; NaN likewise
+    off_scale: bool = False  # whether sy is unknown as pixels are wider or narrower than the design's, in images of its size
 
 
 def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_sy: float | None = None) -> Result:
@@ -215,24 +216,30 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
         raise
     except InputError as error:
         raise InputError(f"{frames.name}: {error}") from None
+    off_scale = scanner_sy is None and frames.size == design.image_size and np.isnan(shown_sy)
     if not settings.tank_known:
-        return Result(found, replace(found.calibration, speed_m_s=implied[0]), shown_sy, implied)
+        return Result(found, replace(found.calibration, speed_m_s=implied[0]), shown_sy, implied, off_scale)
     in_water, wanted = settings.water_speed, settings.wanted_speed
     ratio_sigma = wanted / in_water**2 * settings.water_speed_sigma
     converted = sound_in_water.in_medium(found.calibration, in_water, wanted, ratio_sigma=ratio_sigma)
-    return Result(found, converted, shown_sy, implied)
+    return Result(found, converted, shown_sy, implied, off_scale)
 
 
 def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.float64]) -> Adjusted:
-    """As the phantom's `calibrate`, or the likely mistake in what it refuses, or two parts of which one alone can be right."""
+    """As the phantom's `calibrate`, or the likely mistake in what it refuses, or in two parts that outliers hide."""
     kind = registry.kind(PHANTOMS, frames.phantom)
     try:
         found = kind.calibrate(frames, settings, expected)
     except probe_checks.Misread as error:
         likely = misreadings.explain(frames, kind, settings, expected, error.how) if hasattr(kind, "misfit") else ""
         raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.how, likely) from None
-    if hasattr(kind, "misfit") and (parts := misreadings.two_parts(frames, found.outliers, kind, settings)):
-        raise InputError(f"sightings: expected frames that agree with one another, found {parts}")
+    outliers = found.outliers
+    least = misreadings.FEWEST_AFTER if found.moved is None else misreadings.MANY * len(outliers)  # a movement is of both parts
+    if hasattr(kind, "misfit") and outliers.sum() >= least:
+        parts = misreadings.two_parts(frames, outliers, kind, settings)
+        if parts:
+            found = f"{outliers.sum()} of {len(outliers)} that don't with the others"
+            raise probe_checks.Misread(f"{frames.name}: sightings: expected frames that agree, found {found}", likely=parts)
     return found
 
 

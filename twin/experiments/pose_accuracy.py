@@ -30,6 +30,7 @@ Locate = Callable[[Pair, Images], Array | None]  # from two frames to world_from
 
 SEED = 2002
 LIT_DN, COUNT, BLURRED = 120.0, 40, 12  # frames of the static study, and of each other blur
+MANY = 0.5  # of the poses, of which a ratio of medians is told
 FINE = 64  # rays a pixel, so that rendering's noise is small beside the sensor's where covariances are tested
 
 
@@ -79,18 +80,21 @@ def poses_at_rest(setup: Setup) -> Figures:
 
 
 def beside_recipe(setup: Setup, white_dn: float, blur_px: float) -> Figures:
-    """Poses that the published recipe finds with the same networks in the same frames, and its errors over ours."""
+    """Poses by us and by the published recipe, of the same networks in the same frames; ratios of those that both find."""
     setup, known = exactly_printed(setup), nets.load(kind=setup.rig.target.kind)
     sample = list(tracking_frames.study(setup, SEED, COUNT, white_dn, blur_px))
-    results = [located(take, given, setup.rig.target, known) for take, given in sample]
-    recipe = [pose_errors(take, published_recipe(known)(cameras_of(take), given.views)) for take, given in sample]
+    results, locate = [located(take, given, setup.rig.target, known) for take, given in sample], published_recipe(known)
+    recipe = [pose_errors(take, locate(cameras_of(take), given.views)) for take, given in sample]
     ours = np.array([(one.shift_mm, one.turn_deg) for one in results])
     theirs = np.array([(np.nan, np.nan) if one is None else one for one in recipe])
     both = np.isfinite(ours[:, 0]) & np.isfinite(theirs[:, 0])
-    shift, turn = np.median(theirs[both], axis=0) / np.median(ours[both], axis=0)
-    figures = {"both": both.sum(), "shift_ratio": shift, "turn_ratio": turn}
+    figures: Figures = {"pairs": len(sample)}
     for name, errors in (("ours", ours), ("recipe", theirs)):
-        figures |= {f"{name}_percent": 100 * np.isfinite(errors[:, 0]).mean(), f"{name}_mm": np.nanmedian(errors[:, 0])}
+        found = errors[np.isfinite(errors[:, 0])]
+        figures |= {f"{name}_found": len(found)} | ({f"{name}_mm": np.median(found[:, 0])} if len(found) else {})
+    if np.mean(both) > MANY:
+        shift, turn = np.median(theirs[both], axis=0) / np.median(ours[both], axis=0)
+        figures |= {"shift_ratio": shift, "turn_ratio": turn}
     return figures
 
 
