@@ -74,18 +74,20 @@ def two_parts(frames: PhantomFrames, outliers: NDArray[np.bool_], kind: ModuleTy
     Frames of both parts may agree by a wrong scale, others of both being outliers : (n,) of the usable frames: then the result is
     of neither part. It is of one part, and right there, if the other's are outliers.
     """
-    count, most = len(outliers), LESS * kind.misfit(frames, settings)
-    best, agree = 0, most
-    for first in _evenly(kind.MIN_FRAMES, count - kind.MIN_FRAMES).tolist() if count >= 2 * kind.MIN_FRAMES else ():
-        worst = 0.0
-        for part in (np.arange(first), np.arange(first, count)):
-            worst = max(worst, kind.misfit(_some(frames, part), settings) if worst < agree else np.inf)
-        best, agree = (first, worst) if worst < agree else (best, agree)
-    if not best or max(outliers[:best].mean(), outliers[best:].mean()) > OF_OTHER:
+    count, least = len(outliers), kind.MIN_FRAMES
+    if count < 2 * least:
+        return ""
+    misfits = {
+        first: max(kind.misfit(_some(frames, part), settings) for part in np.split(np.arange(count), [first]))
+        for first in _evenly(least, count - least).tolist()
+    }
+    first = min(misfits, key=lambda each: misfits[each])
+    of_one = max(outliers[:first].mean(), outliers[first:].mean()) > OF_OTHER
+    if of_one or misfits[first] >= LESS * kind.misfit(frames, settings):
         return ""
     numbers = frames.numbers[frames.usable]
-    ends = f"frames {numbers[0]} to {numbers[best - 1]} agree with one another, and so do {numbers[best]} to {numbers[-1]}"
-    return f"; {ends}, but not with the others: {CHANGED}, at about frame {numbers[best]}"
+    ends = f"frames {numbers[0]} to {numbers[first - 1]} agree with one another, and so do {numbers[first]} to {numbers[-1]}"
+    return f"; {ends}, but not with the others: {CHANGED}, at about frame {numbers[first]}"
 
 
 def _readings(frames: PhantomFrames, kind: ModuleType) -> Iterator[tuple[str, PhantomFrames]]:

@@ -235,11 +235,11 @@ def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.f
         raise probe_checks.Misread(f"{frames.name}: {error.fault}", error.how, likely) from None
     outliers = found.outliers
     least = misreadings.FEWEST_AFTER if found.moved is None else misreadings.MANY * len(outliers)  # a movement is of both parts
-    if hasattr(kind, "misfit") and outliers.sum() >= least:
-        parts = misreadings.two_parts(frames, outliers, kind, settings)
-        if parts:
-            found = f"{outliers.sum()} of {len(outliers)} that don't with the others"
-            raise probe_checks.Misread(f"{frames.name}: sightings: expected frames that agree, found {found}", likely=parts)
+    if outliers.sum() < least or not hasattr(kind, "misfit"):
+        return found
+    if parts := misreadings.two_parts(frames, outliers, kind, settings):
+        fault = f"{outliers.sum()} of {len(outliers)} that don't with the others"
+        raise probe_checks.Misread(f"{frames.name}: sightings: expected frames that agree, found {fault}", likely=parts)
     return found
 
 
