@@ -248,8 +248,10 @@ def calibrate(
     equations = FrameEquations(slopes[..., :used], left, UNKNOWNS["probe"], UNKNOWNS["wire"], estimate.known[:used])
     moved = movement.find(equations, inliers)
     if moved is not None and (moved.turn_deg > MOST_MOVED_DEG or moved.shift_mm > MOST_MOVED_MM):
-        fault = f"sightings: expected frames of one point at rest, found that {moved.described}"
-        raise probe_checks.Misread(fault, how="moved")
+        least = f"more than {MOST_MOVED_DEG:g} deg or {MOST_MOVED_MM:g} mm"
+        raise probe_checks.Misread(
+            f"sightings: expected frames of one point at rest, found some that a movement by {least} parts"
+        )
     solved, inliers = inliers, inliers if moved is None else moved.frames
     alike = movement.alike(slopes[inliers][..., :used], left[inliers], equations.known) if moved is None else moved.alike
     step, covariance = movement.average(equations, solved, inliers, factor, alike)
@@ -267,7 +269,8 @@ def calibrate(
         unsure = "" if sightings.pose_by_lag is None else "; the uncertainty of the lag is in it: hold still, or measure the lag"
         also = f"; {late.described}" if late is not None and late.shown else unsure
         if moved is not None:  # what moves by much may be something else
-            raise probe_checks.Misread(f"{error}; {moved.described}", how="moved") from None
+            found = f"sightings: expected frames of one point at rest, found that {moved.described}"
+            raise probe_checks.Misread(f"{found} ({error})", how="moved") from None
         raise InputError(f"{error}{also}") from None
     covariance[SHIFT, SHIFT] += ahead_sigma_mm**2 * np.outer(*2 * (estimate.target_from_image[:3, 1],))
     uncertainty = Uncertainty(NAMES, (covariance + covariance.T) / 2)

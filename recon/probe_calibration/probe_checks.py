@@ -214,7 +214,7 @@ def scanner_scale(implied: float, calibration: ProbeCalibration) -> None:
     """Refuse a calibration of which no scale of the scanner implies the speed of sound, m/s, where nothing else has it."""
     if np.isnan(implied):
         expected = "expected the water's temperature, or the scanner's mm/px, as rig.probe.scale_mm_per_px is of other images"
-        way = "give temperature_c=..., or rig.probe.scale_mm_per_px=[sx,sy]"
+        way = "are lengths of poses right? then give temperature_c=..., or rig.probe.scale_mm_per_px=[sx,sy] by the scanner"
         raise InputError(f"calibration: sy: {expected}, found neither: {way} ({_in_the_tank(calibration)})")
 
 

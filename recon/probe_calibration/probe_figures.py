@@ -26,6 +26,7 @@ from recon.probe_calibration.tank_calibration import Result, Settings
 
 COLUMNS = ("frame", "status", "u", "v", "contrast_db", "residual_mm", "normalised", "reason")  # of the table of frames
 FIVE_POINTS = ("centre", "top_left", "top_right", "bottom_left", "bottom_right")
+WIDER, SURE = 0.015, 4.0  # relative, and standard deviations, of sx beyond the scanner's: to 1 % scanners have it
 EDGE = 3  # frames at an end, of which it is said that all are outliers
 SPEEDS_APART = 0.03  # relative; water 15 degrees colder, or a depth setting of 50 mm for one of 48
 SHOWN_DEPTH_MM = 50.0  # at which the error of a wrong speed of sound is reported
@@ -98,6 +99,9 @@ def describe_frames(frames: PhantomFrames, seconds: float) -> Iterator[str]:
     found, count = len(frames.usable), len(frames.numbers)
     shows = registry.kind(PHANTOMS, frames.phantom).SHOWS
     yield f"find        {count} frames, {width}x{height}: {shows} in {found}, {count - found} rejected, {seconds:.0f} s"
+    told = [np.concatenate([frames.poses[k].ravel(), frames.seen[k].pixel]) for k in frames.usable]
+    if again := len(told) - len(np.unique(told, axis=0)):
+        yield f"warning     {again} frames repeat pose and pixel of others, and count again, so that sigma is too small"
     for reason, numbers in phantom_frames.rejected(frames).items():
         yield f"rejected    {len(numbers)} {reason}: frame{'s' if len(numbers) > 1 else ''} {_listed(numbers)}"
 
@@ -131,7 +135,7 @@ def describe(frames: PhantomFrames, result: Result, figures: Metrics, design: Pr
             slipped = f"if the bracket slipped {there} them, the result is of {there}"
             yield f"warning     the {which} {count} frames are outliers: {slipped}"
     yield f"uncertain   image centre {centre}, corners {edge} (1 sigma, of the place in space)"
-    yield from _describe_sound(figures, result.off_scale, design, settings)
+    yield from _describe_sound(figures, result.wider, settings)
 
 
 def describe_comparison(figures: Metrics, earlier: object) -> str:
@@ -144,14 +148,13 @@ def describe_comparison(figures: Metrics, earlier: object) -> str:
     return f"warning     the probe moved against its target by {by} since {earlier}: a bent bracket, or a target that slipped"
 
 
-def _describe_sound(figures: Metrics, off_scale: bool, design: Probe, settings: Settings) -> Iterator[str]:
+def _describe_sound(figures: Metrics, wider: float, settings: Settings) -> Iterator[str]:
     speed, sigma = figures["implied_speed_m_per_s"], figures["implied_speed_sigma_m_per_s"]
     shown_sy, assumed, in_water = figures["scanner_sy_mm_per_px"], settings.assumed_speed, figures["water_speed_m_per_s"]
-    if off_scale:
-        ratio = figures["sx_mm_per_px"] / design.scale_mm_per_px[0]
-        likely = "another depth setting or scanner, whose [sx,sy] it takes, or the lengths of the poses?"
-        yield f"warning     sy isn't checked, as pixels are {ratio:.3f} times as wide as rig.probe.scale_mm_per_px: {likely}"
-    elif np.isnan(shown_sy):
+    if abs(wider - 1) > max(WIDER, SURE * figures["sx_sigma_mm_per_px"] / figures["sx_mm_per_px"]):
+        causes = "wrong lengths of the poses, or another depth setting or scanner, whose [sx,sy] it takes"
+        yield f"warning     pixels are {wider:.3f} times as wide as rig.probe.scale_mm_per_px: {causes}"
+    if np.isnan(shown_sy):
         yield "sound       not checked by sy, as the scanner's mm/px are unknown; rig.probe.scale_mm_per_px=[sx,sy] does"
     else:
         yield f"sound       {speed:.1f} ± {sigma:.1f} m/s by sy, if the scanner's is {shown_sy:g} mm/px for {assumed:g} m/s"

@@ -182,7 +182,7 @@ class Result:
     calibration: ProbeCalibration  # for the medium of later sweeps
     shown_sy: float  # mm/px by which the scanner draws depths; NaN if unknown
     implied_speed: tuple[float, float]  # of sound in the tank by both sy, m/s, and its standard deviation; NaN likewise
-    off_scale: bool = False  # whether sy is unknown as pixels are wider or narrower than the design's, in images of its size
+    wider: float = 1.0  # times sx is the design's, in images of its size, where nothing else tells the scanner's
 
 
 def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_sy: float | None = None) -> Result:
@@ -216,13 +216,14 @@ def calibrate(frames: PhantomFrames, design: Probe, settings: Settings, scanner_
         raise
     except InputError as error:
         raise InputError(f"{frames.name}: {error}") from None
-    off_scale = scanner_sy is None and frames.size == design.image_size and np.isnan(shown_sy)
+    designed = scanner_sy is None and frames.size == design.image_size
+    wider = float(found.calibration.scale[0] / design.scale_mm_per_px[0]) if designed else 1.0
     if not settings.tank_known:
-        return Result(found, replace(found.calibration, speed_m_s=implied[0]), shown_sy, implied, off_scale)
+        return Result(found, replace(found.calibration, speed_m_s=implied[0]), shown_sy, implied, wider)
     in_water, wanted = settings.water_speed, settings.wanted_speed
     ratio_sigma = wanted / in_water**2 * settings.water_speed_sigma
     converted = sound_in_water.in_medium(found.calibration, in_water, wanted, ratio_sigma=ratio_sigma)
-    return Result(found, converted, shown_sy, implied, off_scale)
+    return Result(found, converted, shown_sy, implied, wider)
 
 
 def _calibrate(frames: PhantomFrames, settings: Settings, expected: NDArray[np.float64]) -> Adjusted:

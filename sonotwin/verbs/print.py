@@ -13,7 +13,7 @@ target are described: docs/calibration.md says how.
     sonotwin print part=board board='{kind: aprilgrid, columns: 6, rows: 6, tag_mm: 24}' paper=a4 out=aprilgrid.pdf
     sonotwin print part=target out=target.pdf
     sonotwin print part=target rig=three_bodies body=needle out=needle.pdf
-    sonotwin print part=target family=3 out=targets.pdf
+    sonotwin print part=target family=3 rig=three_bodies out=targets.pdf
 """
 
 from pathlib import Path
@@ -120,6 +120,7 @@ def draw_targets(config: Config, first: Target) -> None:
     own = "" if config.body == PROBE else f" body={config.body}"
     following = f"sonotwin calibrate-target capture=film{own} out=target  # of a film of it as it was printed"
     report(config, pages[0].card, pages[0].sheet, following)
+    names = {tuple(getattr(target, length) for length in target.LENGTHS): name for name, target in config.rig.bodies.items()}
     if len(targets) > 1:
         print(f"page 1      the {config.body}'s; in a rig's file, with names of your own for the others:")
         print("            bodies:")
@@ -128,7 +129,8 @@ def draw_targets(config: Config, first: Target) -> None:
         given = (*target.LENGTHS, "outer_diameter_mm", "inner_diameter_mm", "board_mm")
         described = target.model_dump(mode="json")
         fields = ", ".join(f"{name}: {described[name]}" for name in given)
-        print(f"              body{number}: {{{fields}}}  # page {number}, parted by {parted:.1f} mm from the others")
+        name = names.get(tuple(getattr(target, length) for length in target.LENGTHS), f"body{number}")
+        print(f"              {name}: {{{fields}}}  # page {number}, parted by {parted:.1f} mm from the others")
 
 
 def near(name: str, rig: Rig) -> str:

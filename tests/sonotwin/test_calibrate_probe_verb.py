@@ -232,11 +232,13 @@ def test_degrees_fahrenheit_are_named(rig, rng, tmp_path):
 
 
 def test_a_scale_of_the_rig_is_none_of_wider_images(rig, rng, tmp_path, capsys):
-    """Twice as many mm a pixel both ways, of the same size in px: another scanner's, so the temperature is asked for."""
+    """Twice as many mm a pixel both ways, of as many px: another scanner's, which is told, and the temperature asked for."""
     wider = replace(probe_motions.true_probe(rig), scale=2 * np.array(rig.probe.scale_mm_per_px))
     fields = [f"pairs={pairs_of(wider, bscans.SIZE, rng, tmp_path / 'pairs.csv')}", f"out={tmp_path / 'out'}"]
-    assert "give temperature_c=..., or rig.probe.scale_mm_per_px=[sx,sy] (found in the tank: " in complaint(capsys, *fields)
-    assert not any("another depth setting" in line for line in calibrate(*fields, f"temperature_c={sweep_sets.WATER_C}"))
+    assert "rig.probe.scale_mm_per_px=[sx,sy] by the scanner (found in the tank: " in complaint(capsys, *fields)
+    lines = list(calibrate(*fields, f"temperature_c={sweep_sets.WATER_C}"))
+    assert not any("not the tank's speed" in line for line in lines)
+    assert any("times as wide as rig.probe.scale_mm_per_px: wrong lengths of the poses, or another" in line for line in lines)
 
 
 def test_a_tank_of_something_else_has_its_speed_given(rig, rng, tmp_path):

@@ -116,6 +116,10 @@ def test_a_family_of_targets_is_drawn_that_makes_a_rig(tmp_path, capsys):
     bodies = yaml.safe_load(printed[printed.index("            bodies:") :])["bodies"]
     rig = choices.read_rig()
     assert len(Rig.model_validate(rig.model_dump() | {"bodies": bodies}).targets) == 3
+    assert main(["print", "part=target", "family=3", "rig=three_bodies", f"out={out}"]) == 0
+    printed, three = capsys.readouterr().out, choices.read_rig("three_bodies").bodies
+    bodies = yaml.safe_load(printed[printed.index("            bodies:") :])["bodies"]
+    assert {name: body["c1_mm"] for name, body in bodies.items()} == {name: body.c1_mm for name, body in three.items()}
     assert main(["print", "part=target", "rig=three_bodies", "body=needle", f"out={tmp_path / 'needle.pdf'}"]) == 0
     assert "59 x 57 mm" in capsys.readouterr().out
 

@@ -209,14 +209,23 @@ def test_frames_at_no_rest_by_any_reading_get_no_name(rig, frames, rng):
 
 
 def test_lengths_of_poses_that_differ_from_the_scanners_are_warned_of(rig, rng):
-    """By 8 %, as another depth setting would. Not where the scanner's scale isn't known, as of another one's images."""
+    """By 4 and 8 %, as another depth setting would. Not where the scanner's scale isn't known, as of another one's images."""
     frames, settings = crossing(rig, rng), tank_calibration.Settings(temperature_c=22)
-    longer = at(frames, shifted_by(frames.poses, lambda places: 1.08 * places))
-    for given, scanner_sy, told in ((frames, None, False), (longer, None, True), (longer, np.nan, False)):
+    long, longer = (at(frames, shifted_by(frames.poses, lambda places, by=by: by * places)) for by in (1.04, 1.08))
+    for given, scanner_sy, told in ((frames, None, False), (long, None, True), (longer, None, True), (longer, np.nan, False)):
         result = tank_calibration.calibrate(given, rig.probe, settings, scanner_sy)
         figures = probe_figures.measure(given, result, rig.probe, settings)
         lines = list(probe_figures.describe(given, result, figures, rig.probe, settings))
-        assert any(line.startswith("warning     sy isn't checked") for line in lines) == told, lines
+        assert any(line.startswith("warning     pixels are 1.0") and "wrong lengths" in line for line in lines) == told, lines
+
+
+def test_sightings_that_are_given_twice_are_warned_of(rig, rng):
+    """Each row of a table counts, so that sigma would be smaller by the root of two."""
+    seen = crossing(rig, rng).sightings
+    for which, told in ((np.arange(30), False), (np.tile(np.arange(30), 2), True)):
+        frames = phantom_frames.of_pairs("drawn", bscans.SIZE, seen.poses[which], seen.pixels[which])
+        said = "30 frames repeat pose and pixel of others"
+        assert any(said in line for line in probe_figures.describe_frames(frames, 0.0)) == told
 
 
 def test_diagonals_that_run_the_other_way_are_named(rig, rng):
