@@ -35,6 +35,7 @@ FAR = 4.7  # standard deviations, beyond which a frame is an outlier
 TYPICAL = np.sqrt(2 * np.log(2))  # median length of two normal numbers
 LEAST_FRAMES = 12  # with fewer an outlier can't be told from noise that is more than predicted
 ROUNDS, LEAST_LENGTH = 30, 0.1  # of a robust fit; of a residual that is none
+SHOWN, FREE = 1e-8, 1e6  # of the largest effect, what shows at all; standard deviation, rad and mm, of what doesn't
 TOOL, PROBE, SOUND, LATE = "tool", "probe", "sound", "late"  # faults
 
 
@@ -184,16 +185,20 @@ def _outliers(rows: Mapping[str, Array], left: Array) -> Mask:
 
 def _fitted(slopes: Array, left: Array, common: Array) -> Fault:
     """A fault by whitened slopes : (n, 2, k) and residuals : (n, 2), beside common effects : (n, 2, q)."""
-    rows, k = slopes.reshape(left.size, -1), slopes.shape[-1]
-    spread = inverse(rows.T @ rows)
+    rows = slopes.reshape(left.size, -1)
+    sizes, axes = np.linalg.svd(rows, full_matrices=False)[1:]
+    axes, hidden = axes[sizes > SHOWN * sizes[0]], axes[sizes <= SHOWN * sizes[0]]  # what B-scans at one attitude show no part of
+    k = len(axes)
+    spread = (axes.T / sizes[:k] ** 2) @ axes
     values = spread @ rows.T @ left.ravel()
     rest = left - (slopes @ values[:, None])[..., 0]
     alike = persistence(rest)
     level = float((rest**2).sum()) / (left.size - k)
     moved = spread @ rows.T @ common.reshape(left.size, -1)
     covariance = max(level, 1.0) * alike * spread + moved @ moved.T
-    squared = float(values @ inverse(covariance) @ values)
+    shown = axes @ values
+    squared = float(shown @ inverse(axes @ covariance @ axes.T) @ shown)
     chance = fdtrc(k, (left.size - k) / alike, squared / k) if level > 1 else chdtrc(k, squared)
     count = left.size / alike
     criterion = count * np.log(max(float((rest**2).sum()) / left.size, 1e-12)) + k * np.log(count)
-    return Fault(values, covariance, float(chance), float(criterion))
+    return Fault(values, covariance + FREE**2 * hidden.T @ hidden, float(chance), float(criterion))
