@@ -120,7 +120,7 @@ def draw_targets(config: Config, first: Target) -> None:
     own = "" if config.body == PROBE else f" body={config.body}"
     following = f"sonotwin calibrate-target capture=film{own} out=target  # of a film of it as it was printed"
     report(config, pages[0].card, pages[0].sheet, following)
-    names = {tuple(getattr(target, length) for length in target.LENGTHS): name for name, target in config.rig.bodies.items()}
+    names = {_lengths(target): name for name, target in config.rig.bodies.items()}
     if len(targets) > 1:
         print(f"page 1      the {config.body}'s; in a rig's file, with names of your own for the others:")
         print("            bodies:")
@@ -129,8 +129,13 @@ def draw_targets(config: Config, first: Target) -> None:
         given = (*target.LENGTHS, "outer_diameter_mm", "inner_diameter_mm", "board_mm")
         described = target.model_dump(mode="json")
         fields = ", ".join(f"{name}: {described[name]}" for name in given)
-        name = names.get(tuple(getattr(target, length) for length in target.LENGTHS), f"body{number}")
+        name = names.get(_lengths(target), f"body{number}")
         print(f"              {name}: {{{fields}}}  # page {number}, parted by {parted:.1f} mm from the others")
+
+
+def _lengths(target: Target) -> tuple[float, ...]:
+    """By which a target is told from others."""
+    return tuple(getattr(target, name) for name in target.LENGTHS)
 
 
 def near(name: str, rig: Rig) -> str:

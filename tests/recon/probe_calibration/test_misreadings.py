@@ -167,7 +167,7 @@ def test_frames_of_both_sides_of_a_slip_are_no_calibration_though_most_agree(rig
 
 
 def test_the_two_sides_of_a_slip_are_named_where_frames_of_both_agree(rig):
-    """By the numbers of their B-scans, of which every third has no crossing."""
+    """By the numbers of their B-scans, of which every third shows the crossing."""
     rng = np.random.default_rng(0)
     seen = few(rig, rng, 16)
     seen.poses[8:] = seen.poses[8:] @ rigid.from_rotation_vector(np.radians([0, 2.0, 0]), [0, 4.0, 0])
