@@ -103,12 +103,12 @@ def record_shots(
     OSError
         If a frame can't be written; likewise.
     """
-    kept = 0
+    kept = refused = 0
     with recording.sweep(plan.name, plan.purpose, devices) as sweep:
         shown, newest = Shown(show, say, judges, plan.limits, devices), _Newest()
         pairs.start(*plan.triggers)
         with ExitStack() as stack:
-            stack.callback(lambda: say(f"recorded {kept} shots"))
+            stack.callback(lambda: say(f"recorded {kept} shots" + (f", {refused} not kept" if refused else "")))
             stack.callback(stop, pairs, say)
             streams = [FrameStream(one.read, newest.add, plan.silent_s, say) for one in readers(pairs, scanner, say)]
             for stream in streams:
@@ -122,13 +122,15 @@ def record_shots(
                     kept = _drop(sweep, kept)
                     operator.ask(Step(f"deleted the last shot, {kept} are left" if kept else "no shot is there"))
                 elif (shot := _take(newest, streams, operator, plan, say)) is None:
+                    refused += 1
                     operator.ask(Step("nothing kept; take it again"))
+                elif faults := [] if answer == "keep" else _faults(shot, devices, most_moved_px, places):
+                    refused += 1
+                    say(f"not kept: {sentence(faults)}")
+                    operator.ask(Step("hold still and take it again"))
                 else:
-                    faults = [] if answer == "keep" else _faults(shot, devices, most_moved_px, places)
-                    kept = kept if faults else _keep(sweep, shot, kept)
-                    operator.ask(
-                        Step(f"not kept: {sentence(faults)}; hold still and take it again" if faults else f"kept {kept}")
-                    )
+                    kept = _keep(sweep, shot, kept)
+                    operator.ask(Step(f"kept {kept}"))
         for stream in streams:
             stream.check()
     return kept

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 from datetime import date
 from io import StringIO
 from pathlib import Path
@@ -12,6 +13,7 @@ from rich.console import Console
 
 from recon.acquisition.guidance import Step
 from recon.acquisition.recording import open_recording
+from recon.acquisition.target_checks import target_places
 from recon.capture.board_part import read_board
 from recon.capture.manifest import Device, read_manifest
 from recon.capture.sweep_tables import read_stamps
@@ -62,8 +64,16 @@ def test_boards_and_sweeps_grow_in_one_capture(tmp_path, capsys, rig):
 
 
 @pytest.mark.slow
-def test_shots_of_virtual_wires_are_a_sweep_of_stills(tmp_path, capsys, rig):
-    """One a pose of the path, at rest, each with two pairs of frames near enough in time; no terminal is needed."""
+def test_shots_of_virtual_wires_are_a_sweep_of_stills(tmp_path, capsys, rig, monkeypatch):
+    """One a pose of the path, at rest, each with two pairs of frames near enough in time, however slowly they are judged; no
+    terminal is needed.
+    """
+
+    def slow(networks, target):
+        places = target_places(networks, target)
+        return lambda image, bits: (time.sleep(1), places(image, bits))[1]
+
+    monkeypatch.setattr(record, "target_places", slow)
     wires = ("scene=crosswire", "path=wire", "path.count=2", "path.roll_deg=35", "name=wires", "purpose=probe", "shots=true")
     out = tmp_path / "session"
     assert cli.main(["record", "part=sweep", *wires, *QUIET, *half_as_fields(rig), "frames.quality.rim=2", f"out={out}"]) == 0

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Sequence
 
 
 class VirtualClock:
@@ -31,8 +32,10 @@ class VirtualClock:
 class Turns:
     """Devices that run side by side, each rendered when its moment is the next one of all."""
 
-    def __init__(self, clock: VirtualClock) -> None:
+    def __init__(self, clock: VirtualClock, holds: Sequence[int] = ()) -> None:
+        """Before each of the moments of holds, in ns and rising, all wait until they `go_on`."""
         self._clock = clock
+        self._holds = list(holds)
         self._next: dict[str, int] = {}  # ns, by device
         self._changed = threading.Condition()
 
@@ -44,10 +47,21 @@ class Turns:
                 self._next[device] = moment_ns
             self._changed.notify_all()
 
+    def go_on(self) -> None:
+        """Go on until the next hold."""
+        with self._changed:
+            del self._holds[:1]
+            self._changed.notify_all()
+
     def wait(self, device: str, timeout_s: float) -> bool:
         """Wait until a device's frame is the next one of all; whether it came to that in time."""
+
+        def due() -> bool:
+            first = min(self._next, key=lambda name: self._next[name])
+            return first == device and not (self._holds and self._next[device] >= self._holds[0])
+
         with self._changed:
-            return self._changed.wait_for(lambda: min(self._next, key=lambda name: self._next[name]) == device, timeout_s)
+            return self._changed.wait_for(due, timeout_s)
 
     def advance(self, device: str, arrived_ns: int, next_ns: int | None) -> None:
         """A device's frame has arrived, and its next one is due later."""

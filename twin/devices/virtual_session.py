@@ -3,12 +3,15 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from recon.acquisition.guidance import Answer, Operator, Step
 from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.boards import Board
 from recon.model.rig import Rig
+from recon.model.tracks import MAX_GAP_S
 from scenes.catalogue import build_scene
 from scenes.kinds import board
 from twin.devices.shown_light import Pattern
@@ -70,11 +73,13 @@ def before_board(settings: StillSettings, design: Board, patterns: Sequence[Patt
 
 
 def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = False, shots: bool = False) -> SweepDevices:
-    """Devices before a hand that leads the probe, and takes shots all along if so asked; InputError as of `plan_sweep`."""
-    planned, turns = plan_sweep(settings), Turns(VirtualClock(paced))
+    """Devices before a hand that leads the probe, or takes one shot wherever it rests; InputError as of `plan_sweep`."""
+    planned = plan_sweep(settings)
+    times = planned.plan.track.times
+    rests = [int(times[0]), *times[1:][np.diff(times) > 1e9 * MAX_GAP_S].tolist()] if shots else []
+    turns = Turns(VirtualClock(paced), rests)
     pairs, scanner = VirtualPair(planned, ranges, turns), VirtualScanner(planned, turns)
-    operator = EachTime if shots else OneTake
-    return SweepDevices(pairs, scanner, operator(lambda: pairs.over and scanner.over))
+    return SweepDevices(pairs, scanner, EachRest(turns, len(rests)) if shots else OneTake(lambda: pairs.over and scanner.over))
 
 
 def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: Operator) -> StillDevices:
@@ -116,19 +121,26 @@ class OneTake:
         return "end" if self._over() else "wait"
 
 
-class EachTime:
-    """Takes whatever it is asked for, until it is over."""
+class EachRest:
+    """Takes one shot at each rest of the probe, to which it is led while frames are awaited; then ends."""
 
-    def __init__(self, over: Callable[[], bool]) -> None:
-        self._over, self._asked = over, False
+    def __init__(self, turns: Turns, rests: int) -> None:
+        self._turns, self._left = turns, rests
+        self._asked, self._led = False, True
 
     def ask(self, step: Step) -> None:
-        """Hear what is to be taken next."""
+        """Hear that another shot is to be taken."""
         self._asked = True
 
     def answer(self) -> Answer:
-        """`take` once a request, `end` when it is over, `wait` meanwhile."""
-        if self._over():
-            return "end"
-        asked, self._asked = self._asked, False
-        return "take" if asked else "wait"
+        """`take` once a request, `wait` meanwhile, `end` where it is asked for more than rests."""
+        if not self._led:
+            self._led = True
+            self._turns.go_on()
+        elif self._asked:
+            self._asked = False
+            if self._left == 0:
+                return "end"
+            self._left, self._led = self._left - 1, False
+            return "take"
+        return "wait"

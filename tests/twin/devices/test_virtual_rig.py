@@ -80,6 +80,19 @@ def test_devices_take_turns_by_their_moments():
     assert turns.wait("a", 0.0)
 
 
+def test_devices_wait_for_a_hold_to_end():
+    turns = Turns(VirtualClock(), [0, 15])
+    turns.set_next("a", 10)
+    turns.set_next("b", 20)
+    assert not turns.wait("a", 0.0)
+    turns.go_on()
+    assert turns.wait("a", 0.0)
+    turns.advance("a", 11, 30)
+    assert not turns.wait("b", 0.0)
+    turns.go_on()
+    assert turns.wait("b", 0.0)
+
+
 def test_a_paced_clock_is_no_faster_than_life():
     import time
 
