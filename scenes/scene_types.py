@@ -3,6 +3,7 @@
 World is the frame of camera 1, lengths in mm: z points away from the camera into the scene, x right and y down in the image.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from recon.geometry.primitives import Shape, Sphere
+from scenes.tissue import Tissue
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Thing:
     wet: NDArray[np.float32] | None = None  # (n_vertices,), share of the coat that is gel
     smooth: bool = True  # interpolated vertex normals (curved), or flat faces
     inside: bool = False  # hidden within another thing: optics leave it out, ultrasound sees it
+    tissue: Tissue | None = None  # for ultrasound; else its name tells it, see `scenes.acoustics`
     primitive: Sphere | None = None  # the exact shape that the mesh approximates, for a renderer that has one
 
     def __post_init__(self) -> None:
@@ -69,9 +72,31 @@ class Thing:
 
 
 @dataclass(frozen=True, eq=False)
+class Layer:
+    """A tissue inside a scene's things, by its signed distance on a grid: grown from fields, too fine for meshes."""
+
+    name: str
+    distance: NDArray[np.float32]  # (nx, ny, nz) mm, negative inside; of a sheet, its sides have two signs
+    half_mm: float = 0.0  # half the thickness of a sheet; 0 of what is no sheet
+    mirrors: bool = False  # whether its border is as even as a mirror; other borders send no echo of their own
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """Layers in the world, on one grid: the first holds the others, of which the later ones count; all count over `within`."""
+
+    within: str  # name of the last thing that holds them; those after it count over them
+    origin: NDArray[np.float64]  # (3,) mm in the world, of the first grid point
+    step_mm: float
+    layers: tuple[Layer, ...]
+    uneven_db: NDArray[np.float32]  # (nx, ny, nz) backscatter over its tissue's
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """Things in front of the rig, and the shapes that measurements of them are fitted with."""
 
     name: str
     things: tuple[Thing, ...]
     shapes: tuple[Shape, ...] = ()
+    layers: Callable[[], Layers] | None = None  # grows them for ultrasound, which takes seconds; the same each time

@@ -19,7 +19,7 @@ def tumour(size_mm: float, rng: np.random.Generator) -> trimesh.Trimesh:
     lobes = (7, 10)  # fewest and most
     count = rng.integers(lobes[0], lobes[1] + 1)
     lobe_scatter = 0.25  # standard deviation of lobes from an even spread, rad
-    axes = _golden_spiral(int(count)) + lobe_scatter * rng.standard_normal((count, 3))
+    axes = golden_spiral(int(count)) + lobe_scatter * rng.standard_normal((count, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     lobe_height = (0.22, 0.42)  # of the body's radius
     heights = rng.uniform(*lobe_height, count)
@@ -31,7 +31,7 @@ def tumour(size_mm: float, rng: np.random.Generator) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices * (size_mm / caliper(vertices)), sphere.faces, process=False)
 
 
-def _golden_spiral(count: int) -> np.ndarray:
+def golden_spiral(count: int) -> np.ndarray:
     """Unit vectors : (count, 3) spread evenly over the sphere."""
     index = np.arange(count)
     z = 1 - (2 * index + 1) / count

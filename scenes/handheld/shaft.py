@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
-from scenes.acoustics import Tissue
+from scenes.tissue import Tissue
 
 Array = NDArray[np.float64]
 

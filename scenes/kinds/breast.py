@@ -34,13 +34,13 @@ class Tumour(Part):
     centre_mm: Vector
 
 
-class Config(Part):
-    """The phantom of Meza et al. 2021: 170 x 130 x 55 mm with tumours of 27, 14 and 12 mm. The rest is our choice."""
+class Outside(Part):
+    """A breast as light sees it: the size of the phantom of Meza et al. 2021. The rest is our choice."""
 
     size_mm: tuple[Positive, Positive, Positive] = (170.0, 130.0, 55.0)  # length, width, height with the nipple
     middle_mm: tuple[Finite, Finite] = (4.0, -2.0)  # x, y of the footprint's middle in the world
     turn_deg: Finite = 0.0  # about the line of sight
-    table_mm: Positive = 700.0  # z of the table's top
+    table_mm: Positive = 700.0  # z of the table's top, or of the chest
     apex_mm: tuple[Finite, Finite] = (11.0, -7.0)  # nipple from the footprint's middle, towards the fuller side
     taper: Annotated[float, Field(ge=-0.4, le=0.4)] = 0.14  # relative change of width from the middle to an end: a teardrop
     fullness: Annotated[float, Field(ge=0, le=0.25)] = 0.12  # swell of the full side, as a part of the way to the rim
@@ -58,16 +58,10 @@ class Config(Part):
     nipple_reflectance: Fraction = 0.23
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.38
     ior: Annotated[float, Field(ge=1, le=3)] = 1.4
-    tumours: tuple[Tumour, ...] = (
-        Tumour(size_mm=27.0, centre_mm=(-14.0, 6.0, 20.0)),
-        Tumour(size_mm=14.0, centre_mm=(24.0, 16.0, 24.0)),
-        Tumour(size_mm=12.0, centre_mm=(22.0, -22.0, 19.0)),
-    )
-    tissue_mm: NotNegative = 5.0  # least tissue between a tumour and the skin or the base
     seed: Seed = 7
 
     @model_validator(mode="after")
-    def _proportions(self) -> "Config":
+    def _proportions(self) -> "Outside":
         length, width, height = self.size_mm
         if self.nipple_height_mm + self.areola_height_mm >= height / 2:
             raise ValueError(
@@ -82,6 +76,17 @@ class Config(Part):
         return self
 
 
+class Config(Outside):
+    """The phantom of Meza et al. 2021: 170 x 130 x 55 mm with tumours of 27, 14 and 12 mm."""
+
+    tumours: tuple[Tumour, ...] = (
+        Tumour(size_mm=27.0, centre_mm=(-14.0, 6.0, 20.0)),
+        Tumour(size_mm=14.0, centre_mm=(24.0, 16.0, 24.0)),
+        Tumour(size_mm=12.0, centre_mm=(22.0, -22.0, 19.0)),
+    )
+    tissue_mm: NotNegative = 5.0  # least tissue between a tumour and the skin or the base
+
+
 def build(config: Config) -> Scene:
     """Breast, tumours (inside) and table.
 
@@ -91,7 +96,7 @@ def build(config: Config) -> Scene:
         If a tumour lies too near to the skin, to the base or to another tumour.
     """
     shape_rng, colour_rng, tumour_rng = np.random.default_rng(config.seed).spawn(3)
-    skin = dome(_form(config), shape_rng)
+    skin = dome(form_of(config), shape_rng)
     breast = closed(skin)
     streams = tumour_rng.spawn(len(config.tumours))
     masses = [
@@ -99,12 +104,12 @@ def build(config: Config) -> Scene:
         for wanted, rng in zip(config.tumours, streams, strict=True)
     ]
     for k, mass in enumerate(masses):
-        _check_depth(k, mass, skin, config.tissue_mm)
+        check_depth(f"tumours.{k}", mass, skin, config.tissue_mm)
         _check_apart(k, masses)
 
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
-    things = [Thing("breast", solid_meshes.moved(breast, world), material, _albedo(config, skin, colour_rng))]
+    things = [Thing("breast", solid_meshes.moved(breast, world), material, albedo(config, skin, colour_rng))]
     things += [
         Thing(f"tumour{k}", solid_meshes.moved(mass, world), Material(config.reflectance), inside=True)
         for k, mass in enumerate(masses)
@@ -112,7 +117,7 @@ def build(config: Config) -> Scene:
     return Scene("breast", (*things, table(config.table_mm, config.seed)))
 
 
-def world_from_phantom(config: Config) -> Array:
+def world_from_phantom(config: Outside) -> Array:
     """The phantom's pose : (4, 4), its base on the table and its z axis towards the camera."""
     upright = Rotation.from_euler("xz", (180, config.turn_deg), degrees=True)
     return rigid.transform(upright.as_matrix(), (*config.middle_mm, config.table_mm))
@@ -127,7 +132,8 @@ def closed(skin: Dome) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, np.concatenate([skin.faces, base]), process=False)
 
 
-def _form(config: Config) -> Form:
+def form_of(config: Outside) -> Form:
+    """The numbers that shape its dome."""
     return Form(
         size=config.size_mm,
         apex=config.apex_mm,
@@ -145,7 +151,7 @@ def _form(config: Config) -> Form:
     )
 
 
-def _albedo(config: Config, skin: Dome, rng: np.random.Generator) -> NDArray[np.float32]:
+def albedo(config: Outside, skin: Dome, rng: np.random.Generator) -> NDArray[np.float32]:
     """Reflectance of the closed mesh's vertices : skin, darker areola and nipple, paler Montgomery bumps, slightly mottled."""
     mottle = 1 + 0.02 * smooth_noise(skin.vertices, 25, rng) + 0.015 * smooth_noise(skin.vertices, 5, rng)
     areola = np.clip(skin.areola * (1 + 0.12 * smooth_noise(skin.vertices, 4, rng)), 0, 1)
@@ -155,12 +161,12 @@ def _albedo(config: Config, skin: Dome, rng: np.random.Generator) -> NDArray[np.
     return np.clip(np.append(mottle * value, config.reflectance), 0, 1).astype(np.float32)
 
 
-def _check_depth(k: int, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> None:
-    """Refuse tumour k if it has less than `least_mm` of tissue to the skin or the base, or lies outside."""
+def check_depth(name: str, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> None:
+    """Refuse a mass that has less than `least_mm` of tissue to the skin or the base, or lies outside; InputError."""
     to_skin = _depth(mass.vertices, trimesh.Trimesh(skin.vertices, skin.faces, process=False)).min()
     tissue = min(to_skin, mass.vertices[:, 2].min())
     if tissue < least_mm:
-        raise InputError(f"tumours.{k}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
+        raise InputError(f"{name}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
 
 
 def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:

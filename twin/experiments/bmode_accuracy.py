@@ -16,8 +16,9 @@ from scipy.interpolate import CubicSpline
 from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.scene_types import Material, Thing
+from scenes.tissue import Tissue
 from twin.experiments.experiment_setup import Figures, Setup
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam

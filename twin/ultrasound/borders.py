@@ -105,7 +105,9 @@ def _borders_near(clear, side, solids, point, t, radius_mm):
     """Whether a border may lie in a bundle at a depth, and the depth up to which none may; keeps the solids' sides."""
     met, free = False, np.inf
     for solid in range(len(clear)):
-        if clear[solid] < t + GROWTH_MM:
+        if not solids.mirrors[solid]:
+            side[solid], clear[solid] = OUTSIDE, np.inf
+        elif clear[solid] < t + GROWTH_MM:
             d = distance_at(solids, solid, point[0], point[1], point[2])
             side[solid] = NEAR if abs(d) <= radius_mm + GROWTH_MM else INSIDE if d < 0 else OUTSIDE
             clear[solid] = t + (GROWTH_MM if side[solid] == NEAR else min(abs(d) - radius_mm, LEAP_MM))

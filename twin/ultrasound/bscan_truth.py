@@ -45,7 +45,7 @@ def sections(body: Body, world_from_image: Array) -> dict[str, list[Array]]:
     A wire that crosses the plane gives the one point (1, 2) of its axis.
     """
     image_from_world = rigid.invert(world_from_image)
-    found = {solid.name: _outlines(solid.mesh, image_from_world) for solid in body.solids}
+    found = {solid.name: _outlines(solid.mesh, image_from_world) for solid in body.solids if not solid.is_layer}
     for wire in body.wires:
         ends = rigid.apply(image_from_world, wire.ends)
         if ends[0, 2] * ends[1, 2] < 0:

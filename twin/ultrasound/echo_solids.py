@@ -18,10 +18,12 @@ from scipy.ndimage import map_coordinates
 from recon.compiled import njit
 from recon.errors import InputError
 from recon.geometry.primitives import Cylinder
-from scenes.acoustics import BACKSCATTER, Tissue, faster, surroundings, tissue_of
-from scenes.scene_types import Scene, Thing
+from scenes.acoustics import BACKSCATTER, faster, surroundings, tissue_of
+from scenes.scene_types import Layers, Scene, Thing
+from scenes.tissue import Tissue
 from twin import conditions
 from twin.conditions import Sound
+from twin.ultrasound.grown_layers import NONE, Grown, layer_at, layer_distance, packed
 from twin.ultrasound.mesh_distance import Grid, signed_distances
 
 Array = NDArray[np.float64]
@@ -38,6 +40,9 @@ class Solids(NamedTuple):
     distance: NDArray[np.float32]  # (m,) mm, of all grids, one after the other
     grid: NDArray[np.int64]  # (n, 4) place of the first value in `distance`, and points along x, y, z: none of a box
     frame: Array  # (n, 6) first point, mm in the world, and points a mm; of a box its middle, and half its sides, mm
+    mirrors: NDArray[np.bool_]  # (n,) whether the border is even enough for an echo of its own
+    layers: tuple[int, int]  # the first solid that is a layer, and the end
+    grown: Grown  # the layers
 
 
 class Tissues(NamedTuple):
@@ -47,6 +52,8 @@ class Tissues(NamedTuple):
     speed: Array  # m/s
     loss: Array  # nepers a mm, both ways
     roughness: Array  # mm
+    fibres: Array  # nepers of amplitude by which a layer of fibres is brighter where it is met squarely
+    specks: Array  # calcifications a mm3
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +65,10 @@ class Solid:
     distance: NDArray[np.float32]  # (nx, ny, nz) mm, negative inside; none of a box, which its mesh's bounds tell
     origin: Array  # (3,) mm in the world, of the first grid point
     spacing: Array  # (3,) mm
-    mesh: trimesh.Trimesh  # for exact sections
+    mesh: trimesh.Trimesh  # for exact sections; of a layer, that of what holds it
+    is_layer: bool = False  # whether it has grown, on a grid that others share
+    half_mm: float = 0.0  # half the thickness of a layer that is a sheet
+    mirrors: bool = True  # whether its border is even enough for an echo of its own
 
     @property
     def is_box(self) -> bool:
@@ -71,7 +81,8 @@ class Solid:
             beyond = np.abs(points - self.mesh.bounds.mean(axis=0)) - self.mesh.extents / 2
             return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
         places = ((points - self.origin) / self.spacing).T
-        return map_coordinates(self.distance, places, order=1, mode="constant", cval=1e3)
+        found = map_coordinates(self.distance, places, order=1, mode="constant", cval=1e3)
+        return np.abs(found) - self.half_mm if self.half_mm else found
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +102,7 @@ class Body:
     medium: Tissue
     solids: tuple[Solid, ...]
     wires: tuple[Wire, ...]
+    grown: Layers | None = None  # those of the solids that are layers
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -103,7 +115,8 @@ class Body:
 
     @cached_property
     def _packed(self) -> Solids:
-        sizes = [solid.distance.size for solid in self.solids]
+        first = next((k for k, solid in enumerate(self.solids) if solid.is_layer), len(self.solids))
+        sizes = [0 if solid.is_layer else solid.distance.size for solid in self.solids]
         starts = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
         grid = [(int(start), *solid.distance.shape) for start, solid in zip(starts, self.solids, strict=True)]
         frame = [
@@ -112,13 +125,23 @@ class Body:
             else (*solid.origin, *(1 / solid.spacing))
             for solid in self.solids
         ]
-        flat = np.concatenate([solid.distance.ravel() for solid in self.solids]) if sizes else np.zeros(0, np.float32)
-        return Solids(flat, np.array(grid, np.int64).reshape(-1, 4), np.array(frame, float).reshape(-1, 6))
+        own = [solid.distance.ravel() for solid in self.solids if not solid.is_layer]
+        return Solids(
+            np.concatenate(own) if own else np.zeros(0, np.float32),
+            np.array(grid, np.int64).reshape(-1, 4),
+            np.array(frame, float).reshape(-1, 6),
+            np.array([solid.mirrors for solid in self.solids], bool),
+            (first, first + sum(solid.is_layer for solid in self.solids)),
+            packed(self.grown),
+        )
 
     def acoustics(self, frequency_mhz: float) -> Tissues:
         """The tissues' figures at a frequency, for compiled code."""
         loss = self.column("attenuation") * frequency_mhz * np.log(10) / 100  # from dB/cm/MHz
-        return Tissues(self.column("impedance"), self.column("speed"), loss, self.column("roughness"))
+        fibres = self.column("fibres_db") * np.log(10) / 20
+        return Tissues(
+            self.column("impedance"), self.column("speed"), loss, self.column("roughness"), fibres, self.column("specks_per_mm3")
+        )
 
     def column(self, name: str) -> Array:
         """A figure of the tissues by label : (n + 1,)."""
@@ -150,7 +173,17 @@ def body(scene: Scene) -> Body:
         else:
             solids.append(solid(thing, tissue, shape))
     solids.sort(key=lambda one: -float(np.prod(one.mesh.extents)))
-    return Body(surroundings(scene), tuple(solids), tuple(wires))
+    if scene.layers is None:
+        return Body(surroundings(scene), tuple(solids), tuple(wires))
+    grown = scene.layers()
+    inside = 1 + [solid.name for solid in solids].index(grown.within)
+    steps = np.full(3, grown.step_mm)
+    held = solids[inside - 1].mesh
+    layers = [
+        Solid(one.name, tissue_of(scene, one), one.distance, grown.origin, steps, held, True, one.half_mm, one.mirrors)
+        for one in grown.layers
+    ]
+    return Body(surroundings(scene), (*solids[:inside], *layers, *solids[inside:]), tuple(wires), grown)
 
 
 def at_speeds(body: Body, errors: Sound, *key: int) -> Body:
@@ -159,7 +192,7 @@ def at_speeds(body: Body, errors: Sound, *key: int) -> Body:
     if ratio == 1 and warmer == 0:
         return body
     solids = tuple(replace(one, tissue=faster(one.tissue, ratio, warmer)) for one in body.solids)
-    return Body(faster(body.medium, ratio, warmer), solids, body.wires)
+    return replace(body, medium=faster(body.medium, ratio, warmer), solids=solids)
 
 
 def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
@@ -218,6 +251,23 @@ def between(low, high, share):
 @njit(inline="always")
 def distance_at(solids, solid, x, y, z):
     """Signed distance of one solid at a point of the world: of a box exact, else trilinear, and 1e3 outside its grid."""
+    first, end = solids.layers
+    if first <= solid < end:
+        grown = solids.grown
+        return layer_distance(grown.distance, grown.half_mm, grown.first, grown.per_mm, solid - first, x, y, z)
+    return own_distance(solids, solid, x, y, z)
+
+
+@njit(inline="always")
+def is_sheet(solids, solid):
+    """Whether a solid is a layer of two faces."""
+    first, end = solids.layers
+    return first <= solid < end and solids.grown.half_mm[solid - first] > 0
+
+
+@njit(inline="always")
+def own_distance(solids, solid, x, y, z):
+    """Signed distance of a solid with a grid of its own, or none."""
     grid, frame = solids.grid, solids.frame
     if grid[solid, NX] == 0:
         return _box_distance(frame, solid, x, y, z)
@@ -250,7 +300,13 @@ def _box_distance(frame, solid, x, y, z):
 @njit(inline="always")
 def label_at(solids, x, y, z):
     """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
+    (first, end), grown = solids.layers, solids.grown
     for k in range(len(solids.grid) - 1, -1, -1):
-        if distance_at(solids, k, x, y, z) <= 0:
+        if first <= k < end:
+            if k == end - 1:
+                layer = layer_at(grown.sure, grown.distance, grown.half_mm, grown.first, grown.per_mm, x, y, z)
+                if layer != NONE:
+                    return first + layer + 1
+        elif own_distance(solids, k, x, y, z) <= 0:
             return k + 1
     return 0

@@ -15,9 +15,10 @@ from recon.compiled import kernel, njit
 from recon.geometry import rigid
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
-from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
+from twin.ultrasound.echo_solids import Body, Tissues, between, distance_at, label_at
+from twin.ultrasound.grown_layers import layer_normal, uneven_at
 from twin.ultrasound.scan_lines import on_lines, widening
-from twin.ultrasound.sound_paths import Paths
+from twin.ultrasound.sound_paths import GRADIENT_MM, Paths
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ RUN = 8  # cells in a row whose tissue is looked up at once, where no border is 
 CLEAR = 1.15  # over a run's reach: distances of bent surfaces are true to second order
 X, Y, Z = range(3)  # rows of `Lattice.face_from_world`, and of a column's places in the face's frame
 LABEL, ALONG, DEPTH, P, Q, R = range(3, 9)  # the others: tissue, place on the lines, and place in the cell in steps of 2^-BITS
+SPECK_MM = 0.05  # scattering length of a calcification of 0.2 mm: of a rigid sphere longer than a wave, half its radius
+WIDTH = 0.26  # sine of the angle off the normal, over which fibres lose their brightness; assumed
 NEAR_BORDER = -1  # a label that has to be looked up at each place
 
 
@@ -42,6 +45,8 @@ class _Lattice(NamedTuple):
     face_from_world: Array  # (3, 4) mm
     half_mm: NDArray[np.float32]  # (m,) half thickness of the slice that a column may meet which crosses the plane at a depth
     strength: NDArray[np.float32]  # (n + 1,) of a scatterer's echo, by label
+    speck: np.float32  # of a calcification's
+    tissues: Tissues
     turns: Field  # (TURNS,) phases of an echo
 
 
@@ -77,7 +82,9 @@ def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> _La
     low, high = _box(transducer, beam, pose, edge)
     face_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
     half = _half_thickness(beam, pose, axes[2], edge, transducer.face is not None)
-    return _Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), turns)
+    speck = np.float32(SPECK_MM * transducer.wavelength_mm)
+    tissues = body.acoustics(transducer.frequency_mhz)
+    return _Lattice(edge, axes, low, high, face_from_world, half, strength.astype(np.float32), speck, tissues, turns)
 
 
 def _axes(pose: Array) -> NDArray[np.int64]:
@@ -188,6 +195,8 @@ def _label_of_run(cell, start, solids, lattice):
     y = edge * (start + RUN / 2 if main == Y else cell[Y] + 0.5)
     z = edge * (start + RUN / 2 if main == Z else cell[Z] + 0.5)
     radius = CLEAR * edge * np.sqrt((RUN / 2) ** 2 + 0.5)
+    if solids.layers[0] < solids.layers[1]:
+        return NEAR_BORDER  # borders are everywhere
     label = 0
     for solid in range(len(solids.grid)):
         d = distance_at(solids, solid, x, y, z)
@@ -229,13 +238,17 @@ def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
     for n in range(found):
         along, y, z, label = places[ALONG, n], places[DEPTH, n], places[Z, n], int(places[LABEL, n])
         if label == NEAR_BORDER:
-            label = _label_on_face(solids, scanner.world_from_face, places[X, n], places[Y, n], z)
-        if lattice.strength[label] == 0:
+            wx, wy, wz = _in_world(scanner.world_from_face, places[X, n], places[Y, n], z)
+            label = label_at(solids, wx, wy, wz)
+        strength = lattice.strength[label]
+        if solids.layers[0] < solids.layers[1]:
+            strength = _uneven_strength(solids, lattice, label, places, n, scanner)
+        if strength == 0:
             continue
         line, level = min(max(int(along * per_line + 0.5), 0), lines - 1), min(int(y * per_level), depths - 2)
         seen = between(paths.shown_mm[line, level], paths.shown_mm[line, level + 1], y * per_level - level)
         weight = beam.elevation[int(y * per_row + 0.5), int(abs(z) * per_column + 0.5)]
-        value = lattice.strength[label] * paths.amplitude[line, level] * weight
+        value = strength * paths.amplitude[line, level] * weight
         across = (along - paths.shift_mm[line, level] / widening(y, scanner.bend)) * per_line + pad
         deposit(field, across, seen * per_sample, value * lattice.turns[int(seen * to_turn) & (TURNS - 1)])
         first, end = min(first, int(across)), max(end, int(across) + 2)
@@ -243,11 +256,44 @@ def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
 
 
 @njit(inline="always")
-def _label_on_face(solids, pose, x, y, z):
-    """Label of a point of the face's frame."""
-    return label_at(
-        solids,
+def _is_speck(places, n, lattice, label, seed):
+    """Whether a scatterer is a calcification."""
+    bits = np.uint64(places[P, n]) ^ np.uint64(places[Q, n]) << np.uint64(BITS) ^ np.uint64(places[R, n]) << np.uint64(2 * BITS)
+    chance = (_mix(bits, seed) >> np.uint64(11)) / 9007199254740992.0
+    return chance < lattice.tissues.specks[label] * lattice.edge_mm**3
+
+
+@njit(inline="always")
+def _in_world(pose, x, y, z):
+    """A point of the face's frame in the world."""
+    return (
         pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
         pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
         pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
     )
+
+
+@njit(inline="always")
+def _uneven_strength(solids, lattice, label, places, n, scanner):
+    """Strength of a scatterer of uneven tissue, of fibres that lie along a layer's faces, or of a calcification."""
+    if lattice.tissues.specks[label] > 0 and _is_speck(places, n, lattice, label, scanner.seed):
+        return lattice.speck
+    value = lattice.strength[label]
+    if value == 0:
+        return value
+    pose, fibres = scanner.world_from_face, lattice.tissues.fibres[label]
+    wx, wy, wz = _in_world(pose, places[X, n], places[Y, n], places[Z, n])
+    grown = solids.grown
+    value *= uneven_at(grown.uneven, grown.first, grown.per_mm, wx, wy, wz)
+    if fibres > 0:
+        value *= _fibres(solids, label - 1, pose, wx, wy, wz, fibres)
+    return value
+
+
+@njit
+def _fibres(solids, solid, pose, x, y, z, fibres):
+    """Amplitude of fibres along a layer's faces, brightest where sound meets them squarely: a Gaussian of WIDTH."""
+    layer, grown = solid - solids.layers[0], solids.grown
+    nx, ny, nz = layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, GRADIENT_MM)
+    cosine = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
+    return np.float32(np.exp(fibres * np.exp((cosine * cosine - 1) / (2 * WIDTH**2))))

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import DEEPER
-from twin.ultrasound.echo_solids import Body, between, distance_at, label_at
+from twin.ultrasound.echo_solids import Body, between, distance_at, label_at, own_distance
+from twin.ultrasound.grown_layers import layer_normal
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
 from twin.ultrasound.transducer import Transducer
 
@@ -32,6 +33,7 @@ class Paths(NamedTuple):
     shown_mm: Map  # (w, m) depth at which the scanner shows it
     amplitude: Map  # (w, m) both ways
     shift_mm: Map  # (w, m) of the beam along the array, by refraction
+    focus: Map  # (w, m) share of the energy that keeps its focus; see `aperture_paths`
 
 
 class _Steps(NamedTuple):
@@ -46,7 +48,7 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     """Follow the lines of one pose : world_from_image (4, 4) mm."""
     sy, lines = transducer.scale_mm_per_px[1], lines_of(transducer)
     size = lines.count, int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
-    tables = [np.full(size, start, np.float32) for start in (0, 1, 0)]
+    tables = [np.full(size, start, np.float32) for start in (0, 1, 0, 1)]
     paths = Paths(sy, np.zeros(size, np.uint8), *tables)
     along = lines.pitch_mm * np.arange(lines.count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), along)
@@ -70,10 +72,13 @@ def reflection(z1, z2, c1, c2, cosine):
 @njit(inline="always")
 def normal_at(solids, solid, x, y, z):
     """Outward normal of a solid at a point of the world, from central differences."""
-    h = GRADIENT_MM
-    a = distance_at(solids, solid, x + h, y, z) - distance_at(solids, solid, x - h, y, z)
-    b = distance_at(solids, solid, x, y + h, z) - distance_at(solids, solid, x, y - h, z)
-    c = distance_at(solids, solid, x, y, z + h) - distance_at(solids, solid, x, y, z - h)
+    h, grown = GRADIENT_MM, solids.grown
+    if solids.layers[0] <= solid < solids.layers[1]:
+        layer = solid - solids.layers[0]
+        return layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, h)
+    a = own_distance(solids, solid, x + h, y, z) - own_distance(solids, solid, x - h, y, z)
+    b = own_distance(solids, solid, x, y + h, z) - own_distance(solids, solid, x, y - h, z)
+    c = own_distance(solids, solid, x, y, z + h) - own_distance(solids, solid, x, y, z - h)
     size = np.sqrt(a * a + b * b + c * c) + 1e-12
     return a / size, b / size, c / size
 
@@ -131,7 +136,8 @@ def _follow(first, end, paths, solids, tissues, steps, poses):
             there = here
             if t >= clear:  # a border may lie as near
                 there = label_at(solids, x, y, z)
-                clear = t + 0.9 * _nearest(solids, x, y, z)
+                if solids.layers[0] == solids.layers[1]:  # else borders are everywhere
+                    clear = t + 0.9 * _nearest(solids, x, y, z)
             if there == here:
                 delay += delays[here]
                 left *= steps.kept[here]

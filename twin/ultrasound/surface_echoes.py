@@ -15,7 +15,7 @@ from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
-from twin.ultrasound.echo_solids import Body, Wire, distance_at
+from twin.ultrasound.echo_solids import Body, Wire, distance_at, label_at
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
 from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
@@ -37,6 +37,7 @@ FROM, TO, DEPTH = range(3)  # columns of a ray's crossings: labels before and be
 CROSSINGS = 256  # of a ray, at most
 BEFORE, AFTER, LAST = range(3)  # rows of the solids' distances, of a step of the march and at the end of a span
 SURE = 0.9  # of a distance: no border is nearer
+BESIDE_BORDER_MM = 0.05  # on either side of which tissues are looked up
 
 
 class Rays(NamedTuple):
@@ -280,6 +281,12 @@ def _facet(ray, y, solids, solid, pose):
     return depth, square, slope_x, slope_z
 
 
+@njit
+def _label_on(ray, solids, t):
+    """Label at a depth of a ray."""
+    return label_at(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+
+
 @njit(inline="always")
 def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths):
     """Lay the echo of a border's facet, and its repeats between border and face."""
@@ -288,6 +295,11 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
     y, square, slope_x, slope_z = _facet(ray, depth, solids, solid, pose)
     if square <= GLANCING:
         return
+    if solids.layers[0] < solids.layers[1]:  # borders without an echo of their own may lie as near
+        beside = BESIDE_BORDER_MM / square
+        here, there = _label_on(ray, solids, y - beside), _label_on(ray, solids, y + beside)
+        if here == there:
+            return
     lines, depths = paths.labels.shape
     line = min(max(int(ray.along / scanner.line_mm + 0.5), 0), lines - 1)
     level = max(int(y / paths.step_mm) - 1, 0)  # before the border, where delays have a kink

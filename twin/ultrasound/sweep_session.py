@@ -53,7 +53,7 @@ PURPOSES: dict[str, Purpose] = {
     "stroke": "volume",
     "hold": "volume",
 }  # by the path's kind
-SUPPORTS = ("table", "tank")  # what things lie on or in
+SUPPORTS = ("table", "tank", "chest")  # what things lie on or in
 
 
 def plan_sweep(

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from recon.compiled import kernel, njit
 from recon.geometry import rigid
-from scenes.acoustics import Tissue
 from scenes.handheld.shaft import Shaft
+from scenes.tissue import Tissue
 from twin.ultrasound.beam import DEEPER, STEP_MM, Beam
 from twin.ultrasound.echo_field import Field, Scanner, field_like, scanner_at
 from twin.ultrasound.echo_solids import Body, label_at

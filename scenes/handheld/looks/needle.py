@@ -9,11 +9,12 @@ from pydantic import Field, field_validator, model_validator
 
 from recon.geometry import rigid
 from recon.model.rig import Finite, NotNegative, Positive, Target
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.handheld import lofts
 from scenes.handheld.held_tool import HeldTool, open_side, tinted
 from scenes.handheld.mesh_parts import Part
 from scenes.handheld.shaft import Shaft
+from scenes.tissue import Tissue
 
 Array = NDArray[np.float64]
 

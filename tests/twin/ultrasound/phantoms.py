@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from recon.geometry import rigid
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
+from scenes.tissue import Tissue
 from twin.ultrasound.echo_solids import Body, Wire
 from twin.ultrasound.transducer import Transducer
 

@@ -12,9 +12,10 @@ from scipy.optimize import brentq
 from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
+from scenes.tissue import Tissue
 from tests.twin.ultrasound.phantoms import down, filament, peak, width_at_half
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import Body, body, solid

@@ -12,8 +12,9 @@ from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder
 from recon.model.fan import Fan
 from scenes import solid_meshes as shapes
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.scene_types import Material, Thing
+from scenes.tissue import Tissue
 from tests.twin.ultrasound.conftest import QUIET
 from tests.twin.ultrasound.phantoms import down, filament, width_at_half
 from tests.twin.ultrasound.test_medium import correlation, echoes

@@ -8,9 +8,10 @@ import pytest
 from recon.geometry import rigid
 from recon.geometry.primitives import Cylinder
 from scenes import solid_meshes as shapes
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.catalogue import build_scene
 from scenes.scene_types import Material, Thing
+from scenes.tissue import Tissue
 from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down, filament
 from twin.ultrasound.beam import beam

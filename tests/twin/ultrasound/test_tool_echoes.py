@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenes.acoustics import TISSUES, Tissue
+from scenes.acoustics import TISSUES
 from scenes.handheld.shaft import Shaft
+from scenes.tissue import Tissue
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import BAND, STEP_MM, _diffract, beam, through_lens

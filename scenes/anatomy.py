@@ -1,0 +1,294 @@
+"""Tissues of a breast, grown from a seed as signed distances on a grid: skin, fat lobules, ligaments, gland, ducts, chest wall.
+
+From the skin inwards: skin; subcutaneous fat in lobules, which Cooper's ligaments part; the gland's cone behind the nipple, with
+islands of fat and ducts; fat behind it; the pectoral muscle under its fascia; ribs; the lung. Lobules are the cells of a warped
+Voronoi diagram, as in Bakic et al. 2003 and Pokrajac et al. 2012, and ligaments their borders.
+
+Phantom frame: chest in z = 0, z up to the apex; see `scenes.dome`.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.interpolate import LinearNDInterpolator
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.spatial import KDTree
+
+from recon.geometry import rigid
+from recon.model.rig import Part, Positive
+from scenes.dome import Dome
+from scenes.scene_types import Layer
+
+Array = NDArray[np.float64]
+Volume = NDArray[np.float32]
+
+REACH_MM = 3.0  # of the distances
+MARGIN_MM = 3.0  # of the grid around the breast
+CHEST_MM = 25.0  # of the grid below the breast
+Density = Literal["fatty", "scattered", "heterogeneous", "dense"]
+GLANDULAR: dict[Density, float] = {"fatty": 0.06, "scattered": 0.15, "heterogeneous": 0.3, "dense": 0.5}
+"""share of the breast's volume; classes of BI-RADS, shares assumed about the mean of 0.16 [Yaffe et al. 2009]"""
+
+
+class Anatomy(Part):
+    """What a breast is grown by; lengths in mm."""
+
+    density: Density = "heterogeneous"
+    """of the gland, by the classes of BI-RADS"""
+    skin_mm: Annotated[float, Field(ge=0.3, le=5)] = 1.6
+    """thickness of the skin [Willson et al. 1982: 1.62 in mammograms; Warszawski: 1.68 by ultrasound]"""
+    areola_skin_mm: Annotated[float, Field(ge=0, le=5)] = 0.8
+    """by which the skin is thicker at the areola; assumed"""
+    lobule_mm: Annotated[float, Field(ge=4, le=40)] = 18.0
+    """width of fat lobules, which are 0.45 of it thick: patients lie on their backs; assumed"""
+    ligament_mm: Annotated[float, Field(ge=0.05, le=2)] = 0.25
+    """least thickness of Cooper's ligaments; up to four times as thick here and there; assumed"""
+    subcutaneous_mm: Annotated[float, Field(ge=0, le=40)] = 8.0
+    """fat between skin and gland, none at the nipple; assumed"""
+    retromammary_mm: Annotated[float, Field(ge=0, le=40)] = 4.0
+    """fat between gland and muscle; assumed"""
+    ducts: Annotated[int, Field(ge=0, le=40)] = 12
+    """main ducts; 9 on average [Ramsay et al. 2005], more by others"""
+    muscle_mm: Positive = 9.0
+    """thickness of the pectoral muscle; assumed"""
+    rib_mm: Positive = 32.0
+    """from rib to rib; assumed"""
+    uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.0
+    """standard deviation of the backscatter within a tissue, over 2 to 8 mm; assumed"""
+    voxel_mm: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+    """of the grid"""
+
+
+class Grid(NamedTuple):
+    """Points of the phantom's frame, evenly."""
+
+    first: Array  # (3,) mm
+    step: float  # mm
+    shape: tuple[int, int, int]
+
+    def axes(self) -> tuple[Array, Array, Array]:
+        """Coordinates, mm, that broadcast to the grid."""
+        x, y, z = (start + self.step * np.arange(count) for start, count in zip(self.first, self.shape, strict=True))
+        return x[:, None, None], y[None, :, None], z[None, None, :]
+
+    def points(self) -> Array:
+        """All of them : (n, 3) mm."""
+        return np.stack(np.broadcast_arrays(*self.axes()), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Grown:
+    """Tissues of a breast in its frame."""
+
+    grid: Grid
+    layers: tuple[Layer, ...]  # the first one, all under the skin, holds the others, of which the later ones count
+    uneven_db: Volume  # backscatter over its tissue's
+    depth: Volume  # mm under the skin
+
+
+def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> Grown:
+    """Grow the tissues under a skin that stands on the chest's plane."""
+    low, high = skin.vertices.min(axis=0), skin.vertices.max(axis=0)
+    first = np.array([*(low[:2] - MARGIN_MM), -CHEST_MM])
+    step = anatomy.voxel_mm
+    shape = tuple((np.ceil((high + MARGIN_MM - first) / step) + 1).astype(int).tolist())
+    grid = Grid(first, step, shape)
+    x, y, z = grid.axes()
+    noise = _Noise(grid, rng)
+
+    depth = _depth_under(skin, grid)
+    nipple = skin.vertices[skin.vertices[:, 2].argmax()]
+    from_nipple = np.hypot(x - nipple[0], y - nipple[1])
+    skin_mm = anatomy.skin_mm + anatomy.areola_skin_mm * np.exp(-((from_nipple / 14) ** 2))
+    muscle = (z - 4 - 1.5 * noise.plane(60)).astype(np.float32)  # height over the muscle
+    chest_mm = 3 + 0.0002 * (x**2 + y**2)  # by which the chest falls away to the sides
+    muscle = np.maximum(muscle + chest_mm, skin_mm + 2 - depth).astype(np.float32)
+
+    gland = _gland(anatomy, grid, noise, depth, muscle, from_nipple)
+    sheets = _ligaments(anatomy, grid, noise)
+    layers = [
+        Layer("fat", _cut(skin_mm - depth), mirrors=True),
+        *(Layer(f"ligament{k}", sheet, half_mm=anatomy.ligament_mm / 2) for k, sheet in enumerate(sheets)),
+        Layer("gland", gland),
+    ]
+    if anatomy.ducts:
+        layers.append(Layer("duct", _ducts(anatomy, grid, gland, nipple, rng)))
+    core = np.hypot(from_nipple, np.maximum(nipple[2] - 12 - z, 0))
+    layers += [
+        Layer("nipple", _cut(core - 5.5)),
+        Layer("muscle", _cut(muscle)),
+        Layer("fascia", muscle.clip(-REACH_MM, REACH_MM), half_mm=0.3),
+        Layer("rib", _ribs(anatomy, grid, muscle), mirrors=True),
+        Layer("lung", _cut(muscle + anatomy.muscle_mm + 11), mirrors=True),
+    ]
+    coarse, strands = noise(7), noise((9, 9, 1.5))  # of fat, and of gland and muscle: fibres that lie about level
+    uneven = anatomy.uneven_db * np.where((muscle < 0) | (gland < 0), 2 * strands + coarse, 0.7 * coarse + 0.7 * strands)
+    return Grown(grid, tuple(layers), uneven.astype(np.float32), depth)
+
+
+def in_world(layer: Volume, grid: Grid, world_from_phantom: Array) -> tuple[Volume, Array]:
+    """The values on a grid along the world's axes, of the same spacing, and its first point : (3,) mm.
+
+    Turns by right angles about the axes change no value; others interpolate.
+    """
+    corners = np.array([grid.first, grid.first + grid.step * (np.array(grid.shape) - 1)])
+    box = np.stack(np.meshgrid(*corners.T, indexing="ij"), axis=-1).reshape(-1, 3)
+    world = rigid.apply(world_from_phantom, box)
+    first, last = world.min(axis=0), world.max(axis=0)
+    turn = np.rint(world_from_phantom[:3, :3])
+    if np.allclose(turn, world_from_phantom[:3, :3], atol=1e-9):
+        order = np.abs(turn).argmax(axis=1)
+        values = np.transpose(layer, order)
+        return np.ascontiguousarray(values[tuple(slice(None, None, int(turn[k, order[k]])) for k in range(3))]), first
+    counts = np.ceil((last - first) / grid.step).astype(int) + 1
+    points = np.stack(
+        np.meshgrid(*(start + grid.step * np.arange(n) for start, n in zip(first, counts, strict=True)), indexing="ij")
+    )
+    places = np.einsum(
+        "ij,j...->i...", np.linalg.inv(world_from_phantom[:3, :3]), points - world_from_phantom[:3, 3, None, None, None]
+    )
+    values = map_coordinates(layer, (places - grid.first[:, None, None, None]) / grid.step, order=1, mode="nearest")
+    return values.astype(np.float32), first
+
+
+class _Noise:
+    """Smooth random fields on a grid, of zero mean and unit variance, each drawn anew."""
+
+    def __init__(self, grid: Grid, rng: np.random.Generator) -> None:
+        self._grid, self._rng = grid, rng
+
+    def __call__(self, length_mm: float | tuple[float, float, float]) -> Volume:
+        """Over lengths, mm, along x, y, z: about the distance from a hill to the next hollow."""
+        sigma = np.broadcast_to(np.asarray(length_mm, float), 3) / np.pi / self._grid.step
+        white = self._rng.standard_normal(self._grid.shape, dtype=np.float32)
+        smooth = gaussian_filter(white, sigma, mode="wrap")
+        return smooth / smooth.std()
+
+    def plane(self, length_mm: float) -> Volume:
+        """The same for every z."""
+        flat = _Noise(self._grid._replace(shape=(*self._grid.shape[:2], 1)), self._rng)
+        return flat((length_mm, length_mm, 1e-6))
+
+
+def _cut(distance: Array) -> Volume:
+    return np.clip(distance, -REACH_MM, REACH_MM).astype(np.float32)
+
+
+def _depth_under(skin: Dome, grid: Grid) -> Volume:
+    """Depth under the skin, mm, negative outside: to its facets near it, else by whole voxels; beside the breast, the chest's."""
+    z = grid.axes()[2]
+    inside = _is_inside(skin, grid)
+    outside_mm, inside_mm = (np.asarray(distance_transform_edt(side, sampling=grid.step)) for side in (~inside, inside))
+    depth = inside_mm - outside_mm - np.where(inside, 0.5, -0.5) * grid.step
+    near = (np.abs(depth) < 5) & (z > -1)
+    points = grid.points()[near.ravel()]
+    distance, nearest = KDTree(skin.vertices).query(points, distance_upper_bound=8, workers=-1)
+    met = np.isfinite(distance)
+    vertex = np.where(met, nearest, 0)
+    along = np.einsum("ij,ij->i", skin.vertices[vertex] - points, _normals(skin)[vertex])
+    by_facet = np.where(distance < 3, along, np.sign(along) * distance)
+    depth[near] = np.where(met, by_facet, depth[near])
+    return depth.astype(np.float32)
+
+
+def _normals(skin: Dome) -> Array:
+    a, b, c = (skin.vertices[skin.faces[:, k]] for k in range(3))
+    facing = np.cross(b - a, c - a)
+    normals = np.zeros_like(skin.vertices)
+    for k in range(3):
+        np.add.at(normals, skin.faces[:, k], facing)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _is_inside(skin: Dome, grid: Grid) -> NDArray[np.bool_]:
+    """Whether points lie under the skin or under the chest's plane."""
+    x, y, z = grid.axes()
+    height = LinearNDInterpolator(skin.vertices[:, :2], skin.vertices[:, 2], fill_value=0.0)(x[:, :, 0], y[:, :, 0])
+    return z < np.maximum(height, 0)[:, :, None]
+
+
+def redistance(field: Volume, step: float) -> Volume:
+    """Distances, mm, to a field's zero level, of its sign: by its slope near the level, by whole voxels farther off."""
+    slope = np.linalg.norm(np.gradient(field, step), axis=0)
+    near = field / np.maximum(slope, 1e-6)
+    outside, inside = (np.asarray(distance_transform_edt(side, sampling=step)) for side in (field > 0, field <= 0))
+    far = outside - inside - np.sign(field) * step / 2
+    return np.where(np.abs(far) <= step, np.clip(near, -1.5 * step, 1.5 * step), far).clip(-REACH_MM, REACH_MM).astype(np.float32)
+
+
+def _gland(anatomy: Anatomy, grid: Grid, noise: _Noise, depth: Volume, muscle: Volume, from_nipple: Array) -> Volume:
+    """Distance to the gland: a cone from the nipple to the muscle with a ragged border, and islands of fat in it."""
+    covered = anatomy.subcutaneous_mm * (1 + 0.35 * noise.plane(30)) * (1 - np.exp(-((from_nipple / 16) ** 2)))
+    wide = 0.36 * (grid.shape[0] + grid.shape[1]) / 2 * grid.step
+    within = np.minimum(depth - anatomy.skin_mm - covered, muscle - anatomy.retromammary_mm)
+    within = np.minimum(within, (wide + 9 * noise.plane(35) - from_nipple) / 2)
+    ragged = within + 2.5 * noise(14) + 1.5 * noise(5)
+    breast = (depth > anatomy.skin_mm) & (muscle > 0)
+    share = GLANDULAR[anatomy.density]
+    level = max(float(np.quantile(ragged[breast], 1 - 1.25 * share)), 0.0)
+    fat = noise(9) + 0.4 * noise(4) - 0.9  # positive in islands
+    return np.maximum(redistance(level - ragged, grid.step), redistance(fat, grid.step))
+
+
+def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise) -> list[Volume]:
+    """Distances to two sets of sheets, of sign: borders of Voronoi cells that fall to different sides of a toss.
+
+    Two tosses part three quarters of neighbours, so that some lobules hang together. Distances are stretched where sheets are
+    thin, never beyond the true ones.
+    """
+    lobule = anatomy.lobule_mm * np.array([1, 1, 0.45])
+    warp = [0.22 * anatomy.lobule_mm * noise(anatomy.lobule_mm) for _ in range(3)]
+    scaled = np.stack([(axis + bent) / size for axis, bent, size in zip(grid.axes(), warp, lobule, strict=True)], axis=-1)
+    low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
+    cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
+    seeds = cells.reshape(-1, 3) + 0.5 + noise._rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
+    distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
+    thick = noise(20)
+    sheets = []
+    for _ in range(2):
+        side = noise._rng.random(len(seeds)) < 0.5
+        heads = side[nearest]
+        to_heads, to_tails = (np.where(kind, distance, np.inf).min(axis=1) for kind in (heads, ~heads))
+        gap = np.clip((to_tails - to_heads) / 2, -0.5, 0.5).reshape(grid.shape)
+        slope = np.linalg.norm(np.gradient(gap, grid.step), axis=0)
+        true = gap / np.maximum(slope, 0.5 / anatomy.lobule_mm)
+        sheets.append(_cut(true * np.exp(0.6 * (thick - 1)).clip(0.25, 1)))
+    return sheets
+
+
+def _ducts(anatomy: Anatomy, grid: Grid, gland: Volume, nipple: Array, rng: np.random.Generator) -> Volume:
+    """Distance to ducts: from the nipple they fan out into the gland, fork, and thin from 1.2 to 0.6 mm of radius."""
+    places, radii = [], []
+    for turn in 2 * np.pi * (np.arange(anatomy.ducts) + rng.uniform(-0.3, 0.3, anatomy.ducts)) / max(anatomy.ducts, 1):
+        spread = rng.uniform(0.4, 1.15)  # rad from the axis
+        start = nipple - [0, 0, 5] + [2 * np.cos(turn), 2 * np.sin(turn), 0]
+        heading = np.array([np.sin(spread) * np.cos(turn), np.sin(spread) * np.sin(turn), -np.cos(spread)])
+        branches = [(start, heading, 60)]
+        while branches:
+            place, heading, left = branches.pop()
+            while left > 0:
+                heading = heading + 0.06 * rng.standard_normal(3)
+                heading /= np.linalg.norm(heading)
+                place, left = place + 0.8 * heading, left - 1
+                places.append(place)
+                radii.append(0.6 + 0.6 * left / 60)
+                if 8 < left < 45 and rng.random() < 0.03:
+                    aside = heading + 0.6 * rng.standard_normal(3)
+                    branches.append((place, aside / np.linalg.norm(aside), left - 5))
+    distance, nearest = KDTree(np.array(places)).query(grid.points(), distance_upper_bound=REACH_MM + 2, workers=-1)
+    radius = np.append(radii, 0.0)[nearest]
+    tube = np.where(np.isfinite(distance), distance - radius, REACH_MM).reshape(grid.shape)
+    return _cut(np.maximum(tube, gland))
+
+
+def _ribs(anatomy: Anatomy, grid: Grid, muscle: Volume) -> Volume:
+    """Distance, at most the true one, to ribs across the chest, oval, slightly bent."""
+    x, y, _ = grid.axes()
+    wide, thick = 6.5, 4.0  # half of a rib's width and thickness
+    across = y - 0.12 * x - 0.0006 * x**2
+    beside = (across + anatomy.rib_mm / 2) % anatomy.rib_mm - anatomy.rib_mm / 2
+    below = muscle + anatomy.muscle_mm + thick
+    return _cut((np.hypot(beside / wide, below / thick) - 1) * thick)

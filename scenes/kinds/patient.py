@@ -1,0 +1,147 @@
+"""A patient on her back: a breast grown from a seed, on a chest with muscle, ribs and lung, and masses as radiologists say.
+
+Masses lie in what has grown as they are: touching, in clusters, in gland or fat. The skin is that of the breast phantom.
+"""
+
+from functools import partial
+from typing import Annotated, Literal
+
+import numpy as np
+import trimesh
+from pydantic import Field
+
+from recon.geometry import rigid
+from recon.model.rig import Fraction, Part, Vector
+from scenes import solid_meshes
+from scenes.anatomy import Anatomy, grow, in_world
+from scenes.dome import Dome, dome
+from scenes.kinds.breast import Outside, albedo, check_depth, closed, form_of, world_from_phantom
+from scenes.mass_forms import MassForm, mass
+from scenes.scene_types import Layer, Layers, Material, Scene, Thing
+from scenes.tissue import Tissue
+
+MADE_OF = {  # for ultrasound; see `scenes.acoustics`
+    "": "gel",
+    "breast": "skin",
+    "chest": "muscle",
+    **{name: name for name in ("fat", "ligament", "gland", "duct", "nipple", "muscle", "fascia", "lung")},
+    "rib": "bone",
+}
+Pattern = Literal["anechoic", "hypoechoic", "isoechoic", "hyperechoic", "complex"]
+Behind = Literal["none", "enhancement", "shadow"]
+
+ECHOES: dict[Pattern, float | None] = {
+    "anechoic": None,
+    "hypoechoic": -8.0,
+    "isoechoic": 0.0,
+    "hyperechoic": 8.0,
+    "complex": None,
+}
+"""dB over fat, the reference of BI-RADS; carcinomas and fibroadenomas of Nam et al. 2013 lie 2 to 12 dB below the gland"""
+LOSSES: dict[Behind, float] = {"none": 0.8, "enhancement": 0.3, "shadow": 2.2}
+"""dB/cm/MHz; what lies above and beside a mass loses some 0.75"""
+SPEEDS: dict[Pattern, float] = {
+    "anechoic": 1530.0,
+    "hypoechoic": 1550.0,
+    "isoechoic": 1530.0,
+    "hyperechoic": 1470.0,
+    "complex": 1530.0,
+}
+"""m/s: cysts 1530, carcinomas 1548 to 1570, fibroadenomas about 1530, lipomas as fat [Li et al. 2022]"""
+
+
+class Mass(Part):
+    """One mass, by the words of BI-RADS."""
+
+    size_mm: Annotated[float, Field(ge=2, le=80)]
+    """greatest extent"""
+    centre_mm: Vector
+    """middle in the breast's frame, z up from the chest"""
+    form: MassForm = "oval"
+    pattern: Pattern = "hypoechoic"
+    """echoes over those of fat; `complex` is a cyst with a solid part"""
+    behind: Behind = "none"
+    """what lies behind it"""
+    calcified: bool = False
+    """specks of 0.2 mm, 5 to 20 a cm3"""
+
+    def tissue(self) -> Tissue:
+        """What sound meets in it."""
+        loss = 0.05 if self.pattern in ("anechoic", "complex") and self.behind != "shadow" else LOSSES[self.behind]
+        speed = SPEEDS[self.pattern]
+        density = 1.0 if self.pattern in ("anechoic", "complex") else 1.04
+        specks = 0.02 if self.calcified else 0.0
+        return Tissue(1e-3 * density * speed, speed, loss, ECHOES[self.pattern], 0.03, soft=True, specks_per_mm3=specks)
+
+
+class Config(Outside):
+    """A patient's breast: its outside, its anatomy and its masses."""
+
+    size_mm: tuple[float, float, float] = (165.0, 140.0, 52.0)
+    areola_height_mm: float = 0.5
+    nipple_height_mm: float = 5.0
+    roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
+    anatomy: Anatomy = Anatomy()
+    masses: tuple[Mass, ...] = (
+        Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
+        Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
+        Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
+    )
+    least_mm: Annotated[float, Field(ge=0, le=20)] = 2.0
+    """of tissue between a mass and the skin or the chest"""
+    chest_reflectance: Fraction = 0.45
+
+
+def build(config: Config) -> Scene:
+    """Breast, masses (inside) and chest, with the layers that have grown in them.
+
+    Raises
+    ------
+    InputError
+        If a mass lies too near to the skin or to the chest, or outside.
+    """
+    shape_rng, colour_rng, mass_rng = np.random.default_rng(config.seed).spawn(3)
+    skin = dome(form_of(config), shape_rng)
+    world = world_from_phantom(config)
+    material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
+    things = [
+        Thing(
+            "chest",
+            solid_meshes.moved(_chest(), world),
+            Material(config.chest_reflectance, config.roughness, config.ior, True),
+            smooth=False,
+        ),
+        Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
+    ]
+    for k, (wanted, rng) in enumerate(zip(config.masses, mass_rng.spawn(len(config.masses)), strict=True)):
+        body = solid_meshes.moved(mass(wanted.form, wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
+        check_depth(f"masses.{k}", body, skin, config.least_mm)
+        things.append(Thing(f"mass{k}", solid_meshes.moved(body, world), Material(0.3), inside=True, tissue=wanted.tissue()))
+        if wanted.pattern == "complex":
+            things.append(_solid_part(f"solid{k}", wanted, rng, world))
+    return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world))
+
+
+def _solid_part(name: str, wanted: Mass, rng: np.random.Generator, world: rigid.Array) -> Thing:
+    """The solid part of a complex cyst: on its wall, of half its size."""
+    aside = rng.standard_normal(3)
+    centre = wanted.centre_mm + 0.12 * wanted.size_mm * aside / np.linalg.norm(aside)
+    body = solid_meshes.moved(mass("irregular", 0.4 * wanted.size_mm, rng), rigid.transform(np.eye(3), centre))
+    tissue = wanted.model_copy(update={"pattern": "isoechoic"}).tissue()
+    return Thing(name, solid_meshes.moved(body, world), Material(0.3), inside=True, tissue=tissue)
+
+
+def _chest() -> trimesh.Trimesh:
+    """The chest around and below the breast, its surface in z = 0."""
+    size_mm, thick_mm = (420.0, 340.0), 60.0
+    plate = solid_meshes.slab(*solid_meshes.grid(size_mm, (60, 48)), thick_mm)
+    return solid_meshes.moved(plate, np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def _layers(anatomy: Anatomy, skin: Dome, seed: int, world: rigid.Array) -> Layers:
+    layers, grown = [], grow(anatomy, skin, np.random.default_rng([seed, 1]))
+    for layer in grown.layers:
+        distance, _ = in_world(layer.distance, grown.grid, world)
+        layers.append(Layer(layer.name, distance, layer.half_mm, layer.mirrors))
+    uneven, origin = in_world(grown.uneven_db, grown.grid, world)
+    return Layers("breast", origin, grown.grid.step, tuple(layers), uneven)

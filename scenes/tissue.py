@@ -1,0 +1,29 @@
+"""What sound meets in a tissue or material."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """An acoustic medium.
+
+    Raises
+    ------
+    ValueError
+        If impedance or speed isn't positive, or a loss is negative.
+    """
+
+    impedance: float  # MRayl
+    speed: float  # m/s
+    attenuation: float  # dB/cm/MHz
+    echogenicity: float | None  # dB of the backscatter coefficient over `scenes.acoustics.BACKSCATTER`; None is free of echoes
+    roughness: float = 0.0  # mm, standard deviation of its surface over less than a wavelength
+    soft: bool = False  # whether its speed goes with that of all soft tissue
+    fibres_db: float = 0.0  # by which a layer of fibres is brighter where sound meets it squarely
+    specks_per_mm3: float = 0.0  # calcifications
+
+    def __post_init__(self) -> None:
+        if not (self.impedance > 0 and self.speed > 0):
+            raise ValueError(f"impedance and speed: expected more than 0, found {self.impedance} and {self.speed}")
+        if self.attenuation < 0 or self.roughness < 0:
+            raise ValueError(f"attenuation and roughness: expected 0 or more, found {self.attenuation} and {self.roughness}")

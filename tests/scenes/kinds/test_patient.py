@@ -1,0 +1,51 @@
+"""The patient: masses by their words, refused where they lie outside, layers that are grown only where they are asked for."""
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from recon.errors import InputError
+from scenes.acoustics import TISSUES, tissue_of
+from scenes.anatomy import Anatomy
+from scenes.kinds import patient
+
+COARSE = {"edge_mm": 3.0, "anatomy": Anatomy(voxel_mm=2.0)}
+
+
+def built(**fields):
+    return patient.build(patient.Config(**COARSE, **fields))
+
+
+def test_masses_have_the_tissue_that_their_words_say():
+    words = [{"pattern": "anechoic"}, {"pattern": "hyperechoic"}, {"behind": "shadow"}, {"behind": "enhancement"}]
+    masses = [patient.Mass(size_mm=8, centre_mm=(-30 + 20 * k, 0, 20), **word) for k, word in enumerate(words)]
+    scene = built(masses=masses)
+    cyst, bright, shadow, clear = (tissue_of(scene, thing) for thing in scene.things if thing.inside)
+    assert cyst.echogenicity is None and cyst.attenuation < 0.1
+    assert bright.echogenicity > TISSUES["fat"].echogenicity > shadow.echogenicity
+    assert shadow.attenuation > 2 * TISSUES["gland"].attenuation > 4 * clear.attenuation
+
+
+def test_a_complex_cyst_has_a_solid_part():
+    scene = built(masses=[patient.Mass(size_mm=14, centre_mm=(0, 0, 22), pattern="complex")])
+    cyst, part = (thing for thing in scene.things if thing.inside)
+    assert tissue_of(scene, cyst).echogenicity is None and tissue_of(scene, part).echogenicity is not None
+    assert (Delaunay(cyst.mesh.vertices).find_simplex(part.mesh.vertices) >= 0).mean() > 0.7
+
+
+@pytest.mark.parametrize(
+    ("centre", "found"), [((0, 0, 48), "found -?[0-9.]+ mm"), ((0, 0, 2), "found -?[0-9.]+ mm"), ((95, 0, 10), "found -")]
+)
+def test_a_mass_outside_is_refused(centre, found):
+    with pytest.raises(InputError, match=rf"masses\.0: expected at least 2 mm of tissue to skin and base, {found}"):
+        built(masses=[patient.Mass(size_mm=10, centre_mm=centre)])
+
+
+def test_layers_lie_in_the_world_and_are_the_same_each_time():
+    scene = built(masses=[])
+    first, second = scene.layers(), scene.layers()
+    assert all((one.distance == other.distance).all() for one, other in zip(first.layers, second.layers, strict=True))
+    breast = next(thing.mesh for thing in scene.things if thing.name == "breast")
+    last = first.origin + first.step_mm * (np.array(first.layers[0].distance.shape) - 1)
+    assert (first.origin < breast.bounds[0]).all() and (last > breast.bounds[1]).all()
+    assert {tissue_of(scene, layer) for layer in first.layers} <= set(TISSUES.values())

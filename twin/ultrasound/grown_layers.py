@@ -1,0 +1,155 @@
+"""Layers of tissue that have grown on one grid, point by point: a place costs one look for all of them.
+
+The functions are compiled apart from their callers, and take no more than what they read: handing over costs more than looking.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.compiled import njit
+from scenes.scene_types import Layer, Layers
+
+Array = NDArray[np.float64]
+
+NONE, MIXED = -1, -2  # of a cell: that no layer holds it, or that borders run through it
+FAR_MM = 1e3  # beside the grid
+
+
+class Grown(NamedTuple):
+    """The layers, for compiled code; those without one have an empty grid."""
+
+    distance: NDArray[np.float32]  # (nx, ny, nz, layers) mm, negative inside; of a sheet, its sides have two signs
+    sure: NDArray[np.int8]  # (nx - 1, ny - 1, nz - 1) the layer that holds a whole cell, NONE or MIXED
+    half_mm: NDArray[np.float32]  # (layers,) half the thickness of those that are sheets, 0 of others
+    first: Array  # (3,) mm in the world, the first grid point
+    per_mm: float  # grid points
+    uneven: NDArray[np.float32]  # (nx, ny, nz) amplitude of backscatter over its tissue's
+
+
+def packed(layers: Layers | None) -> Grown:
+    """Layers for compiled code."""
+    if layers is None:
+        empty = np.zeros((0, 0, 0), np.float32)
+        return Grown(empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty)
+    distance = np.stack([one.distance for one in layers.layers], axis=-1)
+    half = np.array([one.half_mm for one in layers.layers], np.float32)
+    uneven = np.exp(layers.uneven_db * np.float32(np.log(10) / 20))
+    return Grown(distance, _sure(layers.layers), half, np.asarray(layers.origin, float), 1 / layers.step_mm, uneven)
+
+
+def _sure(layers: Sequence[Layer]) -> NDArray[np.int8]:
+    """The layer that holds each cell : (nx - 1, ny - 1, nz - 1); within a cell, distances lie between those of its corners."""
+    shape = np.subtract(layers[0].distance.shape, 1)
+    found, outside, partly = np.full(shape, NONE, np.int8), np.zeros(shape, bool), np.zeros(shape, bool)
+    for k, layer in enumerate(layers):
+        low, high = (_of_corners(layer.distance, bound) for bound in (np.minimum, np.maximum))
+        holds = (low >= -layer.half_mm) & (high <= layer.half_mm) if layer.half_mm else high <= 0
+        lacks = (low > layer.half_mm) | (high < -layer.half_mm) if layer.half_mm else low > 0
+        found[holds] = k
+        found[~holds & ~lacks] = MIXED
+        if k == 0:
+            outside, partly = lacks, ~holds & ~lacks
+    found[outside] = NONE
+    found[partly] = MIXED
+    return found
+
+
+def _of_corners(values: NDArray[np.float32], bound: np.ufunc) -> NDArray[np.float32]:
+    """The least or greatest of the eight corners of each cell."""
+    for axis in range(3):
+        before, after = (np.take(values, range(n, values.shape[axis] - 1 + n), axis=axis) for n in (0, 1))
+        values = bound(before, after)
+    return values
+
+
+class _Cell(NamedTuple):
+    """A cell by its first point, i < 0 outside, and the shares of the way to its last one."""
+
+    i: int
+    j: int
+    k: int
+    a: float
+    b: float
+    c: float
+
+
+@njit(inline="always")
+def _cell(first, per_mm, shape, x, y, z):
+    """The cell of a grid that holds a point of the world."""
+    gx, gy, gz = (x - first[0]) * per_mm, (y - first[1]) * per_mm, (z - first[2]) * per_mm
+    if gx < 0 or gy < 0 or gz < 0 or gx > shape[0] - 1 or gy > shape[1] - 1 or gz > shape[2] - 1:
+        return _Cell(-1, -1, -1, 0.0, 0.0, 0.0)
+    i, j, k = min(int(gx), shape[0] - 2), min(int(gy), shape[1] - 2), min(int(gz), shape[2] - 2)
+    return _Cell(i, j, k, gx - i, gy - j, gz - k)
+
+
+@njit(inline="always")
+def _within(v, cell, n):
+    """The trilinear value of column n of a grid : (nx, ny, nz, m) in a cell."""
+    i, j, k, a, b, c = np.uint64(cell.i), np.uint64(cell.j), np.uint64(cell.k), cell.a, cell.b, cell.c
+    one, n = np.uint64(1), np.uint64(n)
+    near = (v[i, j, k, n] * (1 - c) + v[i, j, k + one, n] * c) * (1 - b)
+    near += (v[i, j + one, k, n] * (1 - c) + v[i, j + one, k + one, n] * c) * b
+    far = (v[i + one, j, k, n] * (1 - c) + v[i + one, j, k + one, n] * c) * (1 - b)
+    far += (v[i + one, j + one, k, n] * (1 - c) + v[i + one, j + one, k + one, n] * c) * b
+    return near * (1 - a) + far * a
+
+
+@njit
+def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
+    """The last layer that holds a point of the world, or NONE."""
+    cell = _cell(first, per_mm, distance.shape, x, y, z)
+    if cell.i < 0:
+        return NONE
+    whole = sure[cell.i, cell.j, cell.k]
+    if whole != MIXED:
+        return whole
+    if _within(distance, cell, 0) > 0:
+        return NONE
+    for layer in range(len(half_mm) - 1, -1, -1):
+        d, half = _within(distance, cell, layer), half_mm[layer]
+        if (abs(d) if half > 0 else d) <= half:
+            return layer
+    return NONE
+
+
+@njit
+def layer_distance(distance, half_mm, first, per_mm, layer, x, y, z):
+    """Signed distance of a layer at a point of the world; FAR_MM beside the grid."""
+    d, half = _side(distance, first, per_mm, layer, x, y, z), half_mm[layer]
+    return abs(d) - half if half > 0 else d
+
+
+@njit
+def layer_normal(distance, half_mm, first, per_mm, layer, x, y, z, step_mm):
+    """Outward normal of a layer at a point of the world, of a sheet away from its middle, from central differences."""
+    h, shape = step_mm, distance.shape
+    x = min(max(x, first[0] + h), first[0] + (shape[0] - 1) / per_mm - h)
+    y = min(max(y, first[1] + h), first[1] + (shape[1] - 1) / per_mm - h)
+    z = min(max(z, first[2] + h), first[2] + (shape[2] - 1) / per_mm - h)
+    a = _side(distance, first, per_mm, layer, x + h, y, z) - _side(distance, first, per_mm, layer, x - h, y, z)
+    b = _side(distance, first, per_mm, layer, x, y + h, z) - _side(distance, first, per_mm, layer, x, y - h, z)
+    c = _side(distance, first, per_mm, layer, x, y, z + h) - _side(distance, first, per_mm, layer, x, y, z - h)
+    size = np.sqrt(a * a + b * b + c * c) + 1e-12
+    if half_mm[layer] > 0 and _side(distance, first, per_mm, layer, x, y, z) < 0:
+        size = -size
+    return a / size, b / size, c / size
+
+
+@njit
+def _side(distance, first, per_mm, layer, x, y, z):
+    """Distance to a layer, of a sheet to its middle, with its sides' signs."""
+    cell = _cell(first, per_mm, distance.shape, x, y, z)
+    return FAR_MM if cell.i < 0 else _within(distance, cell, layer)
+
+
+@njit
+def uneven_at(uneven, first, per_mm, x, y, z):
+    """Amplitude of backscatter over its tissue's at a point of the world: of the nearest point of the grid."""
+    i, j, k = int((x - first[0]) * per_mm + 0.5), int((y - first[1]) * per_mm + 0.5), int((z - first[2]) * per_mm + 0.5)
+    if i < 0 or j < 0 or k < 0 or i >= uneven.shape[0] or j >= uneven.shape[1] or k >= uneven.shape[2]:
+        return np.float32(1)
+    return uneven[i, j, k]
