@@ -84,7 +84,7 @@ def beam(transducer: Transducer) -> Beam:
     )
 
 
-def _receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
+def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
     """Width of the dynamic receive aperture, mm, at a depth."""
     return np.clip(np.asarray(depth) / transducer.receive_f_number, NEAREST_MM / 2, transducer.aperture_mm)
 
@@ -97,7 +97,7 @@ def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128
     table = np.empty((len(rows), taps + 1), complex)
     for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
         offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
-        receive = float(_receive_aperture(transducer, depth))
+        receive = float(receive_aperture(transducer, depth))
         sent = _diffract(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
         table[k] = sent * _diffract(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))

@@ -1,25 +1,137 @@
 """From echoes to grey levels: point spread, noise, gain over depth, envelope, logarithm, quantisation."""
 
+from functools import lru_cache
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from recon.compiled import kernel
 from recon.threads import in_threads
 from scenes.acoustics import BACKSCATTER
 from twin.ultrasound.beam import OVERSAMPLING, Beam
-from twin.ultrasound.scan_lines import lines_of
+from twin.ultrasound.beam import beam as beam_of
+from twin.ultrasound.scan_lines import converted, lines_of
+from twin.ultrasound.scanner_picture import compressed_image, mapped_greys, processed
+from twin.ultrasound.sound_paths import Paths
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 Field = NDArray[np.complex64]
 
 
+def envelope(echoes: Field, transducer: Transducer, beam: Beam, paths: Paths, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Envelope : (rows, lines) after the gain, 1 for the reference tissue, of echoes at their places.
+
+    Looks of several bands and directions are averaged by power.
+    """
+    picture, gain = transducer.picture, gain_over_depth(transducer, beam).astype(np.float32)[:, None]
+    ringing, power = (
+        face(transducer).astype(np.float32)[:, None],
+        np.zeros((len(beam.axial), lines_of(transducer).count), np.float32),
+    )
+    grain = noise(transducer, beam, rng)  # of one look; others have it elsewhere
+    for band in range(picture.bands):
+        pulses = in_depth(echoes, beam.axial if picture.bands == 1 else part_of_band(beam, transducer, band))
+        for angle in range(picture.angles):
+            received = _focused(pulses, transducer, beam, paths, angle)
+            received += np.roll(grain, (band * picture.angles + angle) * 17, axis=0)
+            received *= gain
+            received += ringing
+            power += received.real**2 + received.imag**2
+    power /= picture.bands * picture.angles
+    return np.sqrt(power if picture.clutter_db == -100 else power + _clutter(power, transducer, rng))
+
+
+def _focused(pulses: Field, transducer: Transducer, beam: Beam, paths: Paths, angle: int) -> Field:
+    """Echoes of one look after the beam : (rows, lines), with what tissues on the way have spoilt of its focus."""
+    lateral = steered(beam.lateral, transducer, angle)
+    sharp = along(pulses, lateral, beam.reach)
+    if transducer.aperture_rays == 1:
+        return sharp
+    wide = blunt(transducer)
+    row = np.minimum(np.arange(len(sharp)), paths.focus.shape[1] - 1)
+    focus = paths.focus[:, row].T
+    level = np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
+    return np.sqrt(focus) * sharp + np.sqrt(1 - focus) * level * along(
+        pulses, steered(wide.lateral, transducer, angle), wide.reach
+    )
+
+
+@lru_cache(maxsize=8)
+def blunt(transducer: Transducer) -> Beam:
+    """The beam of a third of the apertures: what a disturbed wave front leaves of it, whose patches agree no farther; assumed."""
+    third = {name: 3 * getattr(transducer, name) for name in ("transmit_f_number", "receive_f_number")}
+    return beam_of(transducer.model_copy(update=third | {"aperture_mm": transducer.aperture_mm / 3}))
+
+
+def steered(lateral: Field, transducer: Transducer, angle: int) -> Field:
+    """The point spread along the array of one of the directions that are compounded: its phase runs across it."""
+    picture = transducer.picture
+    if picture.angles == 1:
+        return lateral
+    tilt = np.deg2rad(picture.steered_deg) * (2 * angle / (picture.angles - 1) - 1)
+    turn = 2 * transducer.wavenumber * np.sin(tilt) * lines_of(transducer).pitch_mm  # rad from line to line
+    kept = 2 / 3 + np.cos(turn) / 3  # of the power, as echoes between two lines are shared by both
+    lines = np.arange(lateral.shape[1]) - lateral.shape[1] // 2
+    return (lateral * np.exp(1j * turn * lines) / np.sqrt(kept)).astype(np.complex64)
+
+
+def part_of_band(beam: Beam, transducer: Transducer, band: int) -> Field:
+    """The pulse of one of the parts of the band that are compounded : (rows, taps), as much longer as it is narrower."""
+    bands, row = transducer.picture.bands, transducer.scale_mm_per_px[1] / OVERSAMPLING
+    sigma = transducer.axial_sigma_mm(transducer.rows_mm)[:, None]
+    taps = int(np.ceil(3.3 * bands**0.5 * sigma.max() / row))
+    z = row * np.arange(-taps, taps + 1)
+    middle = (band - (bands - 1) / 2) * 2.0 / np.sqrt(bands) / (2 * sigma)  # rad/mm from the band's middle
+    narrow = bands**0.5
+    pulse = np.exp(-(z**2) / (2 * (narrow * sigma) ** 2)) / narrow**0.5
+    return (pulse * np.exp(2j * middle * z)).astype(np.complex64)
+
+
+def _clutter(power: NDArray[np.float32], transducer: Transducer, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Power of what is smeared along the array, and trails in depth, with speckle of its own."""
+    picture, sx, sy = transducer.picture, lines_of(transducer).pitch_mm, transducer.scale_mm_per_px[1]
+    trail_mm = 3.0  # by which echoes between layers trail behind
+    smeared = gaussian_filter1d(power, picture.clutter_mm / sx, axis=1, mode="nearest", truncate=3)
+    decay = np.exp(-sy / trail_mm)
+    smeared = np.asarray(lfilter([1 - decay], [1, -decay], smeared, axis=0))
+    grain = rng.exponential(size=(len(power) // 2 + 1, power.shape[1] // 4 + 1)).astype(np.float32)
+    grain = cv2.resize(grain, power.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0)
+    return (10 ** (picture.clutter_db / 10) * smeared * grain).astype(np.float32)
+
+
+def shown(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.float32]:
+    """Shares of the grey scale : (rows, lines) of an envelope, before persistence and the grey map."""
+    lines = lines_of(transducer)
+    share = compressed(envelope, transducer)
+    return processed(share, transducer.picture, lines.pitch_mm, transducer.scale_mm_per_px[1], transducer.dynamic_range_db)
+
+
+def image(share: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8]:
+    """The image (h, w) of shares of the grey scale : (rows, lines)."""
+    mapped = converted(mapped_greys(share, transducer.picture), transducer, order=1)
+    return compressed_image(grey(mapped, transducer), transducer.picture)
+
+
 def focused(field: Field, beam: Beam) -> Field:
     """Echoes after pulse and beam : (h, w), from a field of echoes at their places: the coherent sum."""
-    height, (lines, width) = len(beam.axial), (len(field), len(field) - beam.lateral.shape[1] + 1)
-    pulses, focused = np.zeros((height, lines), np.complex64), np.zeros((height, width), np.complex64)
-    in_threads(_in_depth, lines, pulses, field, beam.axial)
-    in_threads(_along, height, focused, pulses, beam.lateral, beam.reach)
+    return along(in_depth(field, beam.axial), beam.lateral, beam.reach)
+
+
+def in_depth(field: Field, axial: NDArray) -> Field:
+    """Echoes after the pulse : (rows, lines)."""
+    pulses = np.zeros((len(axial), len(field)), np.complex64)
+    in_threads(_in_depth, len(field), pulses, field, axial)
+    return pulses
+
+
+def along(pulses: Field, lateral: Field, reach: NDArray[np.int64]) -> Field:
+    """Echoes after the beam along the array : (rows, lines)."""
+    focused = np.zeros((len(pulses), pulses.shape[1] - lateral.shape[1] + 1), np.complex64)
+    in_threads(_along, len(pulses), focused, pulses, lateral, reach)
     return focused
 
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from recon.threads import mapped
 from twin.ultrasound import bmode_image
+from twin.ultrasound.aperture_paths import over_aperture
 from twin.ultrasound.beam import beam
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.medium import scatter
-from twin.ultrasound.scan_lines import converted
 from twin.ultrasound.sound_paths import Paths, follow
 from twin.ultrasound.surface_echoes import surface_echoes, wire_echoes
 from twin.ultrasound.tool_echoes import Tool, tool_echoes
@@ -49,8 +49,15 @@ def scan(
     tools : sequence of Tool
         Where they are at that moment; each shades the tissue and the other tools.
     """
+    envelope, paths = _envelope(scene, transducer, world_from_image, seed, frame, tools)
+    return Scan(bmode_image.image(bmode_image.shown(envelope, transducer), transducer), envelope, paths)
+
+
+def _envelope(
+    scene: Body, transducer: Transducer, world_from_image: Array, seed: int, frame: int, tools: Sequence[Tool]
+) -> tuple[NDArray[np.float32], Paths]:
     spread = beam(transducer)
-    clear = follow(scene, transducer, world_from_image)
+    clear = over_aperture(follow(scene, transducer, world_from_image), scene, transducer, world_from_image)
     near = [tool for tool in tools if tool.is_near(transducer, world_from_image)]
     paths = shaded(clear, near, transducer, world_from_image) if near else clear
     echoes = scatter(scene, transducer, spread, paths, world_from_image, seed)
@@ -60,13 +67,7 @@ def scan(
         others = [other for other in near if other is not tool]
         lit = shaded(clear, others, transducer, world_from_image) if others else clear
         echoes += tool_echoes(tool, scene, transducer, spread, lit, world_from_image)
-    received = bmode_image.focused(echoes, spread)
-    received += bmode_image.noise(transducer, spread, np.random.default_rng([seed, frame]))
-    received *= bmode_image.gain_over_depth(transducer, spread).astype(np.float32)[:, None]
-    received += bmode_image.face(transducer).astype(np.float32)[:, None]
-    envelope = np.abs(received)
-    shown = converted(bmode_image.compressed(envelope, transducer), transducer, order=1)
-    return Scan(bmode_image.grey(shown, transducer), envelope, paths)
+    return bmode_image.envelope(echoes, transducer, spread, paths, np.random.default_rng([seed, frame])), paths
 
 
 def scans(
@@ -78,4 +79,13 @@ def scans(
     """
     poses = np.asarray(world_from_image)
     led = [()] * len(poses) if tools is None else tools
-    return mapped(lambda pose, frame, there: scan(scene, transducer, pose, seed, frame, there), poses, range(len(poses)), led)
+    kept: NDArray[np.float32] | None = None  # of the picture before
+    share = np.float32(transducer.picture.persistence)
+
+    def take(pose: Array, frame: int, there: Sequence[Tool]) -> tuple[NDArray[np.float32], NDArray[np.float32], Paths]:
+        envelope, paths = _envelope(scene, transducer, pose, seed, frame, there)
+        return bmode_image.shown(envelope, transducer), envelope, paths
+
+    for shown, envelope, paths in mapped(take, poses, range(len(poses)), led):
+        kept = shown if kept is None else share * kept + (1 - share) * shown
+        yield Scan(bmode_image.image(kept, transducer), envelope, paths)

@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from recon import registry
 from recon.errors import brief, one_line
 from recon.model.rig import Finite, NotNegative, Part, Positive, Rig
+from twin.ultrasound.scanner_picture import Picture
 
 Array = NDArray[np.float64]
 FACES = "twin.ultrasound.faces"  # a module each
@@ -40,6 +41,9 @@ class Transducer(Part):
     face_ring_mm: NotNegative = 0.35  # over which the ringing of the transducer itself falls to 1/e
     face_ring_db: Finite = 4.0  # its level at the face over the brightest grey; -200 is none
     refraction: bool = True
+    aperture_rays: Annotated[int, Field(ge=1, le=31)] = (
+        1  # over which paths are averaged; 1 is the middle one; see `aperture_paths`
+    )
     scatterers_per_mm3: Annotated[float, Field(ge=1, le=1000)] = 64.0
     tgc_db_per_cm_mhz: NotNegative = 0.5  # attenuation that the gain makes up for
     tgc_limit_db: NotNegative = 55.0  # most gain over depth
@@ -47,6 +51,7 @@ class Transducer(Part):
     noise_db: Finite = -58.0  # under the echo of the reference tissue at the transmit focus without attenuation
     dynamic_range_db: Annotated[float, Field(ge=10, le=120)] = 60.0
     bits: Annotated[int, Field(ge=1, le=8)] = 8
+    picture: Picture = Picture()
 
     @model_validator(mode="before")
     @classmethod

@@ -1,0 +1,103 @@
+"""The scanner's picture: nothing by default; compounding evens grains out as statistics say; each figure does what it names."""
+
+from itertools import islice
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from tests.twin.ultrasound.phantoms import down
+from twin.ultrasound import bmode_image
+from twin.ultrasound.bscan import scan, scans
+from twin.ultrasound.scanner_picture import Picture, mapped_greys, processed
+
+
+def envelope(array, body, **picture):
+    scanner = array.model_copy(update={"picture": Picture(**picture)})
+    return scan(body, scanner, down(scanner, (0, 0, 600)), 1).envelope
+
+
+def snr(found) -> float:
+    """Mean over standard deviation in the middle of the image, of an envelope."""
+    inner = found[120:330, 20:-20]
+    return float(inner.mean() / inner.std())
+
+
+def test_by_default_nothing_is_done(small, speckle):
+    share = np.random.default_rng(0).random((40, 30), np.float32)
+    assert processed(share, Picture(), 0.12, 0.12, 60.0) is share and mapped_greys(share, Picture()) is share
+
+
+def test_looks_even_out_grains_as_independent_ones_do(small, speckle):
+    """Rayleigh's 1.91 of one; of n independent looks sqrt(n) times as much nearly; mean power stays."""
+    one = envelope(small, speckle)
+    bands, angles = envelope(small, speckle, bands=2), envelope(small, speckle, angles=3, steered_deg=12)
+    assert snr(one) == pytest.approx(1.91, abs=0.2)
+    assert 1.2 < snr(bands) / snr(one) < 1.5 and 1.35 < snr(angles) / snr(one) < 1.85
+    for several in (bands, angles):
+        power = [np.mean(found[120:330] ** 2) for found in (one, several)]
+        assert power[1] / power[0] == pytest.approx(1, abs=0.2)
+
+
+def test_lost_focus_widens_grains_and_keeps_their_power(small, speckle):
+    scanner = small.model_copy(update={"aperture_rays": 3})
+    echoes = np.zeros((len(bmode_image.beam_of(scanner).axial), 1))
+    assert len(echoes) == 408
+    sharp, blunt = bmode_image.beam_of(scanner), bmode_image.blunt(scanner)
+    width = [(np.abs(one.lateral[200]) > np.abs(one.lateral[200]).max() / 2).sum() for one in (sharp, blunt)]
+    assert width[1] > 2 * width[0]
+
+
+def test_sliders_and_grey_map_are_as_set():
+    flat = np.full((41, 10), 0.5, np.float32)
+    gained = processed(flat, Picture(sliders_db=(-6, 0, 6)), 0.12, 0.12, 60.0)
+    np.testing.assert_allclose(gained[[0, 20, 40], 0], [0.4, 0.5, 0.6], atol=1e-6)
+    assert mapped_greys(flat, Picture(grey_map=(0, 0.2, 1)))[0, 0] == pytest.approx(0.2)
+
+
+def test_smoothing_despeckling_and_edges():
+    """A step among grains: smoothing blurs both, the guided filter the grains alone, and sharpening lifts the step."""
+    rng = np.random.default_rng(1)
+    step = np.where(np.arange(80) < 40, 0.3, 0.7).astype(np.float32)[None].repeat(80, axis=0)
+    noisy = step + 0.05 * rng.standard_normal(step.shape).astype(np.float32)
+    smooth, even, sharp = (
+        processed(noisy, Picture(**one), 0.12, 0.12, 60.0)
+        for one in ({"smooth_mm": (0.4, 0.4)}, {"despeckle": 1.0}, {"edges": 1.0})
+    )
+    grains = [found[:, :30].std() for found in (noisy, smooth, even, sharp)]
+    assert grains[1] < 0.3 * grains[0] and grains[2] < 0.4 * grains[0] and grains[3] > 1.3 * grains[0]
+    rise = [(found[:, 42].mean() - found[:, 37].mean()) for found in (noisy, smooth, even)]
+    assert rise[1] < 0.75 * rise[0] and rise[2] > 0.85 * rise[0]
+
+
+def test_lines_apart_are_interpolated_between():
+    share = np.random.default_rng(2).random((20, 41), np.float32)
+    found = processed(share, Picture(line_mm=0.5), 0.125, 0.12, 60.0)
+    np.testing.assert_allclose(found[:, ::4], share[:, ::4], atol=1e-6)
+    np.testing.assert_allclose(found[:, 2:-2:4], (share[:, :-4:4] + share[:, 4::4]) / 2, atol=1e-6)
+
+
+def test_persistence_keeps_a_share_of_the_picture_before(small, speckle):
+    scanner = small.model_copy(update={"picture": Picture(persistence=0.5)})
+    poses = np.stack([down(scanner, (0, 5.0 * k, 600)) for k in range(3)])
+    kept = [one.image.astype(float) for one in scans(speckle, scanner, poses, 1)]
+    alone = [one.image.astype(float) for one in islice(scans(speckle, small, poses, 1), 3)]
+    assert (kept[0] == alone[0]).all()
+    np.testing.assert_allclose(kept[2], alone[2] / 2 + alone[1] / 4 + alone[0] / 4, atol=1.0)
+
+
+def test_clutter_fills_what_is_free_of_echoes(small):
+    """Of its level deep in bright tissue, less beside that, and none above."""
+    power = np.zeros((300, 96), np.float32)
+    power[80:, :48] = 1
+    scanner = small.model_copy(update={"picture": Picture(clutter_db=-20.0, clutter_mm=1.5)})
+    smear = bmode_image._clutter(power, scanner, np.random.default_rng(0))
+    inside = smear[180:, :20].mean()
+    assert 10 * np.log10(inside) == pytest.approx(-20, abs=1)
+    assert 0 < smear[180:, 60:80].mean() < inside / 10 and smear[:70].max() == 0
+
+
+@pytest.mark.parametrize("wrong", [{"grey_map": (0.5, 0.2)}, {"grey_map": (0.5,)}, {"bands": 0}, {"jpeg": 101}, {"glow": 1}])
+def test_nonsense_is_refused(wrong):
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
+        Picture(**wrong)
