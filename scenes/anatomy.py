@@ -56,7 +56,7 @@ class Anatomy(Part):
     """thickness of the pectoral muscle; assumed"""
     rib_mm: Positive = 32.0
     """from rib to rib; assumed"""
-    uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.0
+    uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.6
     """standard deviation of the backscatter within a tissue, over 2 to 8 mm; assumed"""
     voxel_mm: Annotated[float, Field(ge=0.5, le=2)] = 1.0
     """of the grid"""

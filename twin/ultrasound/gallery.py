@@ -1,6 +1,7 @@
-"""One picture with a B-scan of each kind of thing, for comparison with published B-scans.
+"""One picture with a B-scan of each kind of thing, or of several patients, for comparison with published B-scans.
 
 python -m twin.ultrasound.gallery docs/images/bscans.png
+python -m twin.ultrasound.gallery --patients conf/ultrasound/clinic.yaml docs/images/patients.jpg
 """
 
 import argparse
@@ -8,9 +9,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from recon.geometry import rigid
+from scenes.anatomy import GLANDULAR
 from scenes.catalogue import build_scene
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import body
@@ -21,6 +24,12 @@ from twin.ultrasound.transducer import Transducer
 TISSUE = Transducer()
 WATER = Transducer(tgc_db_per_cm_mhz=0.0165, gain_db=-40.0)  # conf/ultrasound/water.yaml
 MASSES = {"27 mm": (-10.0, -8.0), "14 mm": (28.0, -24.0), "12 mm": (26.0, 26.0)}  # x, y of the breast's tumours
+PATIENTS = {  # x, y by title, by the gland's density
+    "fatty": {"spiculated mass": (-12.0, -10.0), "to the rib": (-45.0, 10.0)},
+    "scattered": {"cyst": (32.0, -27.0), "ligaments": (0.0, -42.0)},
+    "heterogeneous": {"lobulated mass": (29.0, 29.0), "spiculated mass": (-12.0, -10.0)},
+    "dense": {"cyst": (32.0, -27.0), "gland": (-30.0, 20.0)},
+}
 STATIONS = (  # title, scene, array, face in the world, direction of the array
     ("crossed wires, water", "crosswire", WATER, (4.0, -2.0, 635.0), (1, 0, 0)),
     ("rod of 15.82 mm, water", "inner_cylinder", WATER, (4.0, -2.0, 645.0), (0, 1, 0)),
@@ -45,6 +54,19 @@ def _bscans() -> dict[str, NDArray[np.uint8]]:
     return images
 
 
+def _patients(scanner: Path) -> dict[str, NDArray[np.uint8]]:
+    """B-scans of breasts of all densities, and of masses, by title, as a scanner shows them."""
+    array, images = Transducer(**yaml.safe_load(scanner.read_text(encoding="utf-8"))), {}
+    for seed, density in enumerate(GLANDULAR):
+        made = build_scene({"kind": "patient", "seed": 7 + seed, "anatomy": {"density": density}})
+        breast = body(made)
+        for title, (x, y) in PATIENTS[density].items():
+            still = SurfacePath(start_mm=(x, y), end_mm=(x + 0.5, y), hand=Hand(shift_mm=0, turn_deg=0))
+            pose = along_surface(still, surface_of("breast", breast), array, 1).poses[0]
+            images[f"{density}, {title}"] = scan(breast, array, pose, 7 + seed).image
+    return images
+
+
 def _sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
     """Images of one size, each under its title, in rows of `COLUMNS`."""
     tiles = []
@@ -60,10 +82,14 @@ def _sheet(images: dict[str, NDArray[np.uint8]]) -> NDArray[np.uint8]:
 def main() -> None:
     """Write the sheet, at half its size."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--patients", type=Path, metavar="SCANNER", help="patients as a scanner shows them, instead of phantoms")
     parser.add_argument("picture", type=Path)
-    picture = _sheet(_bscans())
-    small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(parser.parse_args().picture), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    given = parser.parse_args()
+    picture = _sheet(_patients(given.patients) if given.patients else _bscans())
+    scale = 0.75 if given.patients else 0.5
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    packing = [cv2.IMWRITE_JPEG_QUALITY, 85] if given.picture.suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    cv2.imwrite(str(given.picture), small, packing)
 
 
 if __name__ == "__main__":
