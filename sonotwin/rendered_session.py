@@ -28,7 +28,7 @@ WATER_C, WATER_SIGMA_M_S = (
 WIRES, BOTTOM, SCAN, TUBE = "wires", "bottom", "scan", "tube"  # names of sweeps
 RESTING_HZ = 5.0  # pairs of frames, while the probe is held still for each B-scan of the wires
 TANK_HZ = 20.0  # pairs of frames along the inner cylinder, whose tank takes no more
-TUMOURS = "tumour"  # what the things are called that ultrasound looks for
+HIDDEN = ("tumour", "mass")  # names of the things that ultrasound looks for
 INNER_MM = (4.0, -2.0, 670.29)  # the inner cylinder's centre, where conf/scene/cylinders.yaml has it
 
 
@@ -55,7 +55,7 @@ class Settings(render.Config):
     @property
     def looks_inside(self) -> bool:
         """Whether the scene is swept over: a path was given, and there is something to find."""
-        return self.path is not None and TUMOURS in made_of(str(self.scene["kind"]))
+        return self.path is not None and not made_of(str(self.scene["kind"])).keys().isdisjoint(HIDDEN)
 
 
 @dataclass(frozen=True)

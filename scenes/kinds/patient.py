@@ -26,6 +26,8 @@ MADE_OF = {  # for ultrasound; see `scenes.acoustics`
     "chest": "muscle",
     **{name: name for name in ("fat", "ligament", "gland", "duct", "nipple", "muscle", "fascia", "lung")},
     "rib": "bone",
+    "mass": "tumour",  # but for a tissue of its own
+    "solid": "tumour",
 }
 Pattern = Literal["anechoic", "hypoechoic", "isoechoic", "hyperechoic", "complex"]
 Behind = Literal["none", "enhancement", "shadow"]

@@ -15,6 +15,7 @@ from recon.reports import figures
 from recon.reports.figures import Colours
 from twin.evaluation.sweep_errors import Finding, SweepTruth
 from twin.ultrasound import bscan_truth, sweep_session
+from twin.ultrasound.echo_solids import label_at
 
 Array = NDArray[np.float64]
 
@@ -44,8 +45,15 @@ def true_from_pixel(number: int, expected: SweepTruth) -> Array:
 
 
 def tissue_speed(expected: SweepTruth) -> float:
-    """Speed of sound in the thing that was swept over, m/s."""
-    return sweep_session.surface_of("", expected.body).tissue.speed
+    """Speed of sound in the thing that was swept over, m/s; of all that has grown in it, the mean along a way."""
+    body = expected.body
+    swept = sweep_session.surface_of("", body)
+    if body.grown is None:
+        return swept.tissue.speed
+    inside = np.argwhere(swept.distance < 0)
+    places = swept.origin + swept.spacing * inside[:: max(len(inside) // 2000, 1)]
+    labels = [label_at(body.packed(), *place) for place in places]
+    return float(1 / np.mean(1 / body.column("speed")[labels]))
 
 
 def level_section(volume: Volume, z: float, findings: Sequence[Finding]) -> Colours:

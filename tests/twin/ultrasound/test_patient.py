@@ -1,0 +1,79 @@
+"""A patient by sound: tissues in their order, masses as their words say, the same bytes from any number of threads."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numba
+import numpy as np
+import pytest
+import yaml
+
+from scenes.catalogue import build_scene
+from sonotwin.config import folder
+from twin.reports.sweep_pictures import tissue_speed
+from twin.ultrasound.bscan import scan
+from twin.ultrasound.bscan_truth import labels
+from twin.ultrasound.echo_solids import body
+from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
+from twin.ultrasound.sweep_session import surface_of
+from twin.ultrasound.transducer import Transducer
+
+OVER_CYST = (32.0, -27.0)  # x, y of the face's middle, of which the image meets the cyst
+
+
+@pytest.fixture(scope="module")
+def breast():
+    return body(build_scene({"kind": "patient", "seed": 8, "edge_mm": 1.5, "anatomy": {"density": "scattered", "voxel_mm": 1.5}}))
+
+
+@pytest.fixture(scope="module")
+def clinic():
+    return Transducer(**yaml.safe_load((Path(folder()) / "ultrasound" / "clinic.yaml").read_text(encoding="utf-8")))
+
+
+@pytest.fixture(scope="module")
+def pose(breast, clinic):
+    path = SurfacePath(start_mm=OVER_CYST, end_mm=(OVER_CYST[0] + 0.5, OVER_CYST[1]), hand=Hand(shift_mm=0, turn_deg=0))
+    return along_surface(path, surface_of("breast", breast), clinic, 1).poses[0]
+
+
+@pytest.fixture(scope="module")
+def taken(breast, clinic, pose):
+    return scan(breast, clinic, pose, 3)
+
+
+def shown(breast, clinic, taken) -> np.ndarray:
+    """Names of what each pixel shows."""
+    return np.array(["gel", *(solid.name for solid in breast.solids)])[labels(taken.paths, clinic)]
+
+
+def test_tissues_are_shown_in_their_order(breast, clinic, taken):
+    names = shown(breast, clinic, taken)
+    rows = {name: float(np.median(np.nonzero(names == name)[0])) for name in ("breast", "fat", "gland", "muscle", "mass1")}
+    assert rows["breast"] < 40 and rows["breast"] < rows["gland"] < rows["muscle"]
+    assert (names == "breast").any(axis=0).all()  # skin in every column
+
+
+def test_a_cyst_is_free_of_echoes_and_brightens_what_lies_behind(breast, clinic, taken):
+    """The same tissues, behind it and beside."""
+    names = shown(breast, clinic, taken)
+    cyst, below = names == "mass1", np.cumsum(names == "mass1", axis=0) > 20
+    behind = below & (names == "gland") & ~cyst
+    beside = (np.arange(408)[:, None] > np.nonzero(cyst)[0].max()) & ~below & (names == "gland")
+    image = taken.image.astype(float)
+    inside = cyst & np.roll(cyst, 8, axis=0) & np.roll(cyst, -8, axis=0)
+    assert image[inside].mean() < 0.3 * image[names == "fat"].mean()
+    assert image[behind].mean() > 1.1 * image[beside].mean()
+
+
+def test_the_bytes_are_the_same_from_one_thread(breast, clinic, pose, taken):
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        assert (scan(breast, clinic, pose, 3).image == taken.image).all()
+    finally:
+        numba.set_num_threads(threads)
+
+
+def test_the_speed_of_a_breast_is_a_mean_of_its_tissues(breast):
+    assert 1450 < tissue_speed(SimpleNamespace(body=breast)) < 1520
