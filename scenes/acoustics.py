@@ -44,11 +44,11 @@ TISSUES = {
     ),  # 911 kg/m3, 1440 m/s [L]; attenuation of 0.73 at 7 MHz [F]; its echo is the reference of BI-RADS
     "ligament": Tissue(1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
     "gland": Tissue(
-        1.60, 1540.0, 0.75, 7.0, 0.02, True
-    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; ten times the backscatter of fat [A], less in vivo
+        1.60, 1540.0, 0.75, 10.0, 0.02, True
+    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; ten times the backscatter of fat [A]
     "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True),  # fluid and walls, assumed
     "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True),  # dense connective tissue that shadows, assumed
-    "muscle": Tissue(1.73, 1588.0, 0.62, 1.0, 0.02, True, 6.0),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
+    "muscle": Tissue(1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
     "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0),  # as ligaments and tendons [I]; echoes assumed
     "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05),  # 1908 kg/m3, 3515 m/s, attenuation [I]
     "lung": Tissue(0.37, 949.0, 20.0, None, 0.05),  # 394 kg/m3, 949 m/s [I]: it lets nothing back

@@ -57,8 +57,8 @@ class Anatomy(Part):
     rib_mm: Positive = 32.0
     """from rib to rib; assumed"""
     uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.6
-    """standard deviation of the backscatter within a tissue, over 2 to 8 mm; assumed"""
-    voxel_mm: Annotated[float, Field(ge=0.5, le=2)] = 1.0
+    """standard deviation of the backscatter within a tissue, over 2 to 8 mm, and twice that within gland and muscle; assumed"""
+    voxel_mm: Annotated[float, Field(ge=0.7, le=2)] = 1.0
     """of the grid"""
 
 
@@ -119,13 +119,16 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> Grown:
     core = np.hypot(from_nipple, np.maximum(nipple[2] - 12 - z, 0))
     layers += [
         Layer("nipple", _cut(core - 5.5)),
-        Layer("muscle", _cut(muscle)),
-        Layer("fascia", muscle.clip(-REACH_MM, REACH_MM), half_mm=0.3),
+        Layer("muscle", muscle),  # of which the fibres' direction is that of the whole field
+        Layer("fascia", _cut(muscle), half_mm=0.3),
         Layer("rib", _ribs(anatomy, grid, muscle), mirrors=True),
         Layer("lung", _cut(muscle + anatomy.muscle_mm + 11), mirrors=True),
     ]
     coarse, strands = noise(7), noise((9, 9, 1.5))  # of fat, and of gland and muscle: fibres that lie about level
-    uneven = anatomy.uneven_db * np.where((muscle < 0) | (gland < 0), 2 * strands + coarse, 0.7 * coarse + 0.7 * strands)
+    streaky = (muscle < 0) | (gland < 0)
+    spread_db = anatomy.uneven_db * np.where(streaky, 2.0, 1.0)
+    uneven = spread_db * np.where(streaky, (2 * strands + coarse) / np.sqrt(5), (strands + coarse) / np.sqrt(2))
+    uneven -= np.log(10) / 20 * spread_db**2  # so that the mean power is the tissue's
     return Grown(grid, tuple(layers), uneven.astype(np.float32), depth)
 
 
@@ -155,21 +158,21 @@ def in_world(layer: Volume, grid: Grid, world_from_phantom: Array) -> tuple[Volu
 
 
 class _Noise:
-    """Smooth random fields on a grid, of zero mean and unit variance, each drawn anew."""
+    """Smooth random fields on a grid, of unit variance, each drawn anew."""
 
     def __init__(self, grid: Grid, rng: np.random.Generator) -> None:
-        self._grid, self._rng = grid, rng
+        self._grid, self.rng = grid, rng
 
     def __call__(self, length_mm: float | tuple[float, float, float]) -> Volume:
         """Over lengths, mm, along x, y, z: about the distance from a hill to the next hollow."""
         sigma = np.broadcast_to(np.asarray(length_mm, float), 3) / np.pi / self._grid.step
-        white = self._rng.standard_normal(self._grid.shape, dtype=np.float32)
+        white = self.rng.standard_normal(self._grid.shape, dtype=np.float32)
         smooth = gaussian_filter(white, sigma, mode="wrap")
         return smooth / smooth.std()
 
     def plane(self, length_mm: float) -> Volume:
         """The same for every z."""
-        flat = _Noise(self._grid._replace(shape=(*self._grid.shape[:2], 1)), self._rng)
+        flat = _Noise(self._grid._replace(shape=(*self._grid.shape[:2], 1)), self.rng)
         return flat((length_mm, length_mm, 1e-6))
 
 
@@ -183,13 +186,14 @@ def _depth_under(skin: Dome, grid: Grid) -> Volume:
     inside = _is_inside(skin, grid)
     outside_mm, inside_mm = (np.asarray(distance_transform_edt(side, sampling=grid.step)) for side in (~inside, inside))
     depth = inside_mm - outside_mm - np.where(inside, 0.5, -0.5) * grid.step
-    near = (np.abs(depth) < 5) & (z > -1)
+    near = (np.abs(depth) < 5) & (z > 0)
+    facet_mm = float(np.linalg.norm(np.diff(skin.vertices[skin.faces[:, :2]], axis=1), axis=2).max())
     points = grid.points()[near.ravel()]
-    distance, nearest = KDTree(skin.vertices).query(points, distance_upper_bound=8, workers=-1)
+    distance, nearest = KDTree(skin.vertices).query(points, distance_upper_bound=5 + facet_mm, workers=-1)
     met = np.isfinite(distance)
     vertex = np.where(met, nearest, 0)
     along = np.einsum("ij,ij->i", skin.vertices[vertex] - points, _normals(skin)[vertex])
-    by_facet = np.where(distance < 3, along, np.sign(along) * distance)
+    by_facet = np.where(distance < max(3.0, 2 * facet_mm), along, np.sign(along) * distance)
     depth[near] = np.where(met, by_facet, depth[near])
     return depth.astype(np.float32)
 
@@ -244,12 +248,12 @@ def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise) -> list[Volume]:
     scaled = np.stack([(axis + bent) / size for axis, bent, size in zip(grid.axes(), warp, lobule, strict=True)], axis=-1)
     low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
     cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
-    seeds = cells.reshape(-1, 3) + 0.5 + noise._rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
+    seeds = cells.reshape(-1, 3) + 0.5 + noise.rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
     distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
     thick = noise(20)
     sheets = []
     for _ in range(2):
-        side = noise._rng.random(len(seeds)) < 0.5
+        side = noise.rng.random(len(seeds)) < 0.5
         heads = side[nearest]
         to_heads, to_tails = (np.where(kind, distance, np.inf).min(axis=1) for kind in (heads, ~heads))
         gap = np.clip((to_tails - to_heads) / 2, -0.5, 0.5).reshape(grid.shape)
@@ -262,7 +266,7 @@ def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise) -> list[Volume]:
 def _ducts(anatomy: Anatomy, grid: Grid, gland: Volume, nipple: Array, rng: np.random.Generator) -> Volume:
     """Distance to ducts: from the nipple they fan out into the gland, fork, and thin from 1.2 to 0.6 mm of radius."""
     places, radii = [], []
-    for turn in 2 * np.pi * (np.arange(anatomy.ducts) + rng.uniform(-0.3, 0.3, anatomy.ducts)) / max(anatomy.ducts, 1):
+    for turn in 2 * np.pi * (np.arange(anatomy.ducts) + rng.uniform(-0.3, 0.3, anatomy.ducts)) / anatomy.ducts:
         spread = rng.uniform(0.4, 1.15)  # rad from the axis
         start = nipple - [0, 0, 5] + [2 * np.cos(turn), 2 * np.sin(turn), 0]
         heading = np.array([np.sin(spread) * np.cos(turn), np.sin(spread) * np.sin(turn), -np.cos(spread)])

@@ -55,7 +55,8 @@ class Settings(render.Config):
     @property
     def looks_inside(self) -> bool:
         """Whether the scene is swept over: a path was given, and there is something to find."""
-        return self.path is not None and not made_of(str(self.scene["kind"])).keys().isdisjoint(HIDDEN)
+        none = any(self.scene.get(name) in ([], ()) for name in ("tumours", "masses"))
+        return self.path is not None and not none and not made_of(str(self.scene["kind"])).keys().isdisjoint(HIDDEN)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import trimesh
 from pydantic import Field
 
 from recon.geometry import rigid
-from recon.model.rig import Fraction, Part, Vector
+from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
@@ -65,7 +65,7 @@ class Mass(Part):
     behind: Behind = "none"
     """what lies behind it"""
     calcified: bool = False
-    """specks of 0.2 mm, 5 to 20 a cm3"""
+    """specks of 0.2 mm, 20 a cm3"""
 
     def tissue(self) -> Tissue:
         """What sound meets in it."""
@@ -79,9 +79,9 @@ class Mass(Part):
 class Config(Outside):
     """A patient's breast: its outside, its anatomy and its masses."""
 
-    size_mm: tuple[float, float, float] = (165.0, 140.0, 52.0)
-    areola_height_mm: float = 0.5
-    nipple_height_mm: float = 5.0
+    size_mm: tuple[Positive, Positive, Positive] = (165.0, 140.0, 52.0)
+    areola_height_mm: NotNegative = 0.5
+    nipple_height_mm: Positive = 5.0
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
     anatomy: Anatomy = Anatomy()
     masses: tuple[Mass, ...] = (
@@ -125,7 +125,7 @@ def build(config: Config) -> Scene:
 
 
 def _solid_part(name: str, wanted: Mass, rng: np.random.Generator, world: rigid.Array) -> Thing:
-    """The solid part of a complex cyst: on its wall, of half its size."""
+    """The solid part of a complex cyst: beside its middle, of 0.4 of its size."""
     aside = rng.standard_normal(3)
     centre = wanted.centre_mm + 0.12 * wanted.size_mm * aside / np.linalg.norm(aside)
     body = solid_meshes.moved(mass("irregular", 0.4 * wanted.size_mm, rng), rigid.transform(np.eye(3), centre))

@@ -3,7 +3,7 @@
 An echo from a place reaches each element of the aperture on a way of its own. Rays are followed straight from the face, in some
 directions that the aperture of a place takes in; for each place, over those that start on the array,
 
-    amplitude = sum(w a) / sum_all(w),   delay = sum(w D) / sum(w),   focus = exp(-k^2 var(D - tilt)),
+    amplitude = sum(w a) / sum_all(w),   delay = sum(w D) / sum(w),   focus = exp(-2 k^2 var(D - tilt)),
 
 with the aperture's weights w, a ray's amplitude a both ways, and its delay D over that of a medium of the assumed speed. This is
 the mean power, sent and received, and holds for speckle: what a disturbed wave front loses in its focus it sends beside it. A
@@ -15,12 +15,12 @@ Source: Born & Wolf, Principles of Optics, 9.1; Nock, Trahey & Smith 1989 for ph
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import kernel, njit
+from recon.compiled import kernel
 from recon.threads import in_threads
 from twin.ultrasound.beam import receive_aperture
 from twin.ultrasound.echo_solids import Body, between, is_sheet
-from twin.ultrasound.scan_lines import lines_of, widening, world_from_face, world_from_lines
-from twin.ultrasound.sound_paths import Paths, normal_at, reflection
+from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
+from twin.ultrasound.sound_paths import Paths, normal_at, reflection, squareness
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -39,21 +39,20 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
     count, levels = paths.labels.shape
     depths = paths.step_mm * np.arange(levels)
     tangents = np.linspace(-1, 1, rays + 2)[1:-1] / (2 * transducer.receive_f_number)
-    wide = widening(depths, lines.bend)
     places = lines.pitch_mm * np.arange(count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), places)
     along = np.zeros((2, rays, count, levels), np.float32)  # loss and delay down each ray
     tissues = body.acoustics(transducer.frequency_mhz)
     delays = paths.step_mm * (transducer.assumed_speed / tissues.speed - 1)
-    in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, poses, tangents, wide, lines.pitch_mm)
+    in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, poses, tangents, lines.pitch_mm)
     half = receive_aperture(transducer, depths) / 2
     out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(4)))
-    in_threads(_gather, count, out, along, tangents, half, wide, lines.pitch_mm, transducer.wavenumber)
+    in_threads(_gather, count, out, along, tangents, half, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
     return out
 
 
 @kernel
-def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tangents, wide, pitch_mm):
+def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tangents, pitch_mm):
     """Sum loss and delay down the rays that start on some lines, in all directions."""
     count, levels = paths.labels.shape
     step = paths.step_mm
@@ -63,7 +62,7 @@ def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tange
         for start in range(first, end):
             loss, delay, place, here = 0.0, 0.0, float(start), paths.labels[start, 0]
             for level in range(1, levels):
-                place += tangent * step / (pitch_mm * wide[level])
+                place += tangent * step / pitch_mm
                 line = int(min(max(place, 0.0), count - 1.0) + 0.5)
                 there = paths.labels[line, level]
                 if there != here:
@@ -74,7 +73,7 @@ def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tange
                 along[0, ray, start, level], along[1, ray, start, level] = loss, delay
 
 
-@njit
+@kernel
 def _passed(solids, tissues, pose, depth, tangent, here, there):
     """Share of the amplitude that passes a border, there and back, of a ray at a place of a line."""
     solid = max(here, there) - 1
@@ -84,13 +83,13 @@ def _passed(solids, tissues, pose, depth, tangent, here, there):
     nx, ny, nz = normal_at(solids, solid, x, y, z)
     onwards = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
     aside = nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]
-    cosine = max(abs(onwards + tangent * aside) / np.sqrt(1 + tangent * tangent), 0.02)
+    cosine = squareness(solids, solid, (onwards + tangent * aside) / np.sqrt(1 + tangent * tangent))
     r = reflection(tissues.impedance[here], tissues.impedance[there], tissues.speed[here], tissues.speed[there], cosine)
     return max(1 - r * r, 0.0)
 
 
 @kernel(fastmath=True)
-def _gather(first, end, out, along, tangents, half, wide, pitch_mm, wavenumber):
+def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refract):
     """Average over the rays that meet each place of some lines."""
     _, rays, count, levels = along.shape
     step = out.step_mm
@@ -99,7 +98,7 @@ def _gather(first, end, out, along, tangents, half, wide, pitch_mm, wavenumber):
         reach = 0.0  # lines from the start of a ray of tangent 1 to the place below it
         before = 0
         for level in range(1, levels):
-            reach += step / (pitch_mm * wide[level])
+            reach += step / pitch_mm
             if level % STRIDE != 0 and level != levels - 1:
                 continue
             everything = there = power = delay = 0.0
@@ -130,8 +129,8 @@ def _gather(first, end, out, along, tangents, half, wide, pitch_mm, wavenumber):
             left = max(sdd / there - mean * mean - tilt * cross, 0.0)
             out.shown_mm[line, level] = step * level + mean - tilt * x0
             out.amplitude[line, level] = power / everything
-            out.shift_mm[line, level] = tilt / pitch_mm * step * level * wide[level]
-            out.focus[line, level] = np.exp(-(wavenumber * wavenumber) * left)
+            out.shift_mm[line, level] = tilt / pitch_mm * step * level if refract else 0.0
+            out.focus[line, level] = np.exp(-2 * (wavenumber * wavenumber) * left)
             for k in range(before + 1, level):
                 part = np.float32((k - before) / (level - before))
                 for table in (out.shown_mm, out.amplitude, out.shift_mm, out.focus):

@@ -37,7 +37,7 @@ def envelope(echoes: Field, transducer: Transducer, beam: Beam, paths: Paths, rn
         pulses = in_depth(echoes, beam.axial if picture.bands == 1 else part_of_band(beam, transducer, band))
         for angle in range(picture.angles):
             received = _focused(pulses, transducer, beam, paths, angle)
-            received += np.roll(grain, (band * picture.angles + angle) * 17, axis=0)
+            received += np.roll(grain, (band * picture.angles + angle) * len(grain) // (picture.bands * picture.angles), axis=0)
             received *= gain
             received += ringing
             power += received.real**2 + received.imag**2
@@ -54,10 +54,12 @@ def _focused(pulses: Field, transducer: Transducer, beam: Beam, paths: Paths, an
     wide = blunt(transducer)
     row = np.minimum(np.arange(len(sharp)), paths.focus.shape[1] - 1)
     focus = paths.focus[:, row].T
-    level = np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
-    return np.sqrt(focus) * sharp + np.sqrt(1 - focus) * level * along(
-        pulses, steered(wide.lateral, transducer, angle), wide.reach
-    )
+    blurred = along(pulses, steered(wide.lateral, transducer, angle), wide.reach)
+    blurred *= np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
+    inner, energies = (beam.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(beam.lateral) ** 2).sum(axis=1)
+    alike = (inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1)))[:, None]  # of the same scatterers
+    both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike).astype(np.float32)
+    return (np.sqrt(focus) * sharp + np.sqrt(1 - focus) * blurred) / both
 
 
 @lru_cache(maxsize=8)
@@ -105,9 +107,12 @@ def _clutter(power: NDArray[np.float32], transducer: Transducer, rng: np.random.
 
 def shown(envelope: NDArray[np.float32], transducer: Transducer) -> NDArray[np.float32]:
     """Shares of the grey scale : (rows, lines) of an envelope, before persistence and the grey map."""
-    lines = lines_of(transducer)
-    share = compressed(envelope, transducer)
-    return processed(share, transducer.picture, lines.pitch_mm, transducer.scale_mm_per_px[1], transducer.dynamic_range_db)
+    picture, lines = transducer.picture, lines_of(transducer)
+    if picture.sliders_db:
+        places = np.linspace(0, 1, len(picture.sliders_db))
+        gain = 10 ** (np.interp(np.linspace(0, 1, len(envelope)), places, picture.sliders_db) / 20)
+        envelope = envelope * np.float32(gain)[:, None]
+    return processed(compressed(envelope, transducer), picture, lines.pitch_mm, transducer.scale_mm_per_px[1])
 
 
 def image(share: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8]:

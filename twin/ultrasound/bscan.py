@@ -86,6 +86,8 @@ def scans(
         envelope, paths = _envelope(scene, transducer, pose, seed, frame, there)
         return bmode_image.shown(envelope, transducer), envelope, paths
 
-    for shown, envelope, paths in mapped(take, poses, range(len(poses)), led):
-        kept = shown if kept is None else share * kept + (1 - share) * shown
+    leap_mm = 5.0  # from one B-scan to the next, after which nothing of that before is kept
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]), axis=1) if len(poses) else []
+    for step, (shown, envelope, paths) in zip(steps, mapped(take, poses, range(len(poses)), led), strict=True):
+        kept = shown if kept is None or step > leap_mm else share * kept + (1 - share) * shown
         yield Scan(bmode_image.image(kept, transducer), envelope, paths)

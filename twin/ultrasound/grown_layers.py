@@ -1,6 +1,6 @@
 """Layers of tissue that have grown on one grid, point by point: a place costs one look for all of them.
 
-The functions are compiled apart from their callers, and take no more than what they read: handing over costs more than looking.
+Kernels are compiled apart from their callers, and take no more than what they read: handing over costs more than looking.
 """
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import njit
+from recon.compiled import kernel, njit
 from scenes.scene_types import Layer, Layers
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def _within(v, cell, n):
     return near * (1 - a) + far * a
 
 
-@njit
+@kernel
 def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
     """The last layer that holds a point of the world, or NONE."""
     cell = _cell(first, per_mm, distance.shape, x, y, z)
@@ -116,14 +116,14 @@ def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
     return NONE
 
 
-@njit
+@kernel
 def layer_distance(distance, half_mm, first, per_mm, layer, x, y, z):
     """Signed distance of a layer at a point of the world; FAR_MM beside the grid."""
     d, half = _side(distance, first, per_mm, layer, x, y, z), half_mm[layer]
     return abs(d) - half if half > 0 else d
 
 
-@njit
+@kernel
 def layer_normal(distance, half_mm, first, per_mm, layer, x, y, z, step_mm):
     """Outward normal of a layer at a point of the world, of a sheet away from its middle, from central differences."""
     h, shape = step_mm, distance.shape
@@ -139,14 +139,14 @@ def layer_normal(distance, half_mm, first, per_mm, layer, x, y, z, step_mm):
     return a / size, b / size, c / size
 
 
-@njit
+@kernel
 def _side(distance, first, per_mm, layer, x, y, z):
     """Distance to a layer, of a sheet to its middle, with its sides' signs."""
     cell = _cell(first, per_mm, distance.shape, x, y, z)
     return FAR_MM if cell.i < 0 else _within(distance, cell, layer)
 
 
-@njit
+@kernel
 def uneven_at(uneven, first, per_mm, x, y, z):
     """Amplitude of backscatter over its tissue's at a point of the world: of the nearest point of the grid."""
     i, j, k = int((x - first[0]) * per_mm + 0.5), int((y - first[1]) * per_mm + 0.5), int((z - first[2]) * per_mm + 0.5)

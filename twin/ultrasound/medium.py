@@ -160,6 +160,7 @@ def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
             if inside and abs(z) < beam.core_mm[int(depth * per_step + 0.5)]:
                 places[X, found], places[Y, found], places[Z, found], places[LABEL, found] = x, y, z, label
                 places[ALONG, found], places[DEPTH, found] = along, depth
+                places[P, found], places[Q, found], places[R, found] = places[P, n], places[Q, n], places[R, n]
                 found += 1
     return found
 
@@ -285,12 +286,12 @@ def _uneven_strength(solids, lattice, label, places, n, scanner):
     wx, wy, wz = _in_world(pose, places[X, n], places[Y, n], places[Z, n])
     grown = solids.grown
     value *= uneven_at(grown.uneven, grown.first, grown.per_mm, wx, wy, wz)
-    if fibres > 0:
+    if fibres > 0 and solids.layers[0] < label <= solids.layers[1]:
         value *= _fibres(solids, label - 1, pose, wx, wy, wz, fibres)
     return value
 
 
-@njit
+@kernel
 def _fibres(solids, solid, pose, x, y, z, fibres):
     """Amplitude of fibres along a layer's faces, brightest where sound meets them squarely: a Gaussian of WIDTH."""
     layer, grown = solid - solids.layers[0], solids.grown

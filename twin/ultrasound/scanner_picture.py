@@ -1,8 +1,8 @@
 """What a scanner makes of echoes before it shows them: compounding, gain as set, smoothing, edges, grey map.
 
-In the order of a scanner: the coherent sum is taken anew for each look, of a part of the band and from another direction; the
-looks' envelopes are averaged; then come gain, logarithm, persistence, despeckling, edge enhancement, the grey map and the
-interpolation between lines.
+The coherent sum is taken anew for each look, of a part of the band and from another direction, and their powers are averaged.
+Then come clutter, gain, logarithm, smoothing, interpolation between lines, despeckling, edge enhancement, persistence, the grey
+map and compression.
 """
 
 from typing import Annotated
@@ -43,11 +43,11 @@ class Picture(Part):
     edges_mm: Annotated[float, Field(gt=0, le=5)] = 0.5
     """standard deviation of the mask's blur"""
     persistence: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    """share of the picture before that is kept"""
+    """share of the picture before that is kept, as long as the probe stays within 5 mm from one B-scan to the next"""
     grey_map: tuple[Annotated[float, Field(ge=0, le=1)], ...] = ()
     """shown greys of even shares of the dynamic range, from black to white, rising"""
     clutter_db: Annotated[float, Field(ge=-100, le=0)] = -100.0
-    """of what side lobes and echoes between layers smear over the surroundings, under these; -100 is none"""
+    """of what side lobes and echoes between layers smear over the surroundings, under these, anew in each B-scan; -100 is none"""
     clutter_mm: Annotated[float, Field(gt=0, le=20)] = 4.0
     """standard deviation of the smear along the array; in depth, it trails behind"""
     jpeg: Annotated[int, Field(ge=0, le=100)] = 0
@@ -61,16 +61,12 @@ class Picture(Part):
         return values
 
 
-def processed(share: Image, picture: Picture, line_mm: float, row_mm: float, dynamic_db: float) -> Image:
-    """Shares of the grey scale : (rows, lines), 0 to 1, as the scanner shows them.
+def processed(share: Image, picture: Picture, line_mm: float, row_mm: float) -> Image:
+    """Shares of the grey scale : (rows, lines), 0 to 1, as the scanner shows them, before persistence.
 
     line_mm, row_mm : between lines, and between rows
     """
     shown = share
-    if picture.sliders_db:
-        places = np.linspace(0, 1, len(picture.sliders_db))
-        gain = np.interp(np.linspace(0, 1, len(share)), places, picture.sliders_db)
-        shown = np.clip(shown + np.float32(gain / dynamic_db)[:, None], 0, 1)
     if any(picture.smooth_mm):
         shown = gaussian_filter(shown, (picture.smooth_mm[1] / row_mm, picture.smooth_mm[0] / line_mm), mode="nearest")
     if picture.line_mm > line_mm:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import DEEPER
-from twin.ultrasound.echo_solids import Body, between, distance_at, label_at, own_distance
+from twin.ultrasound.echo_solids import Body, between, distance_at, is_sheet, label_at, own_distance
 from twin.ultrasound.grown_layers import layer_normal
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
 from twin.ultrasound.transducer import Transducer
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 LEAP_MM = 2.5  # at most, without a look at the tissue; less than the margin of the solids' grids
+RAGGED = 0.5  # cosine; assumed
 GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
 
@@ -108,12 +109,24 @@ def _share_before(solids, solid, pose, point, step_mm):
     return min(max(back / (back - ahead), 0.0), 1.0) if back != ahead else 0.5
 
 
+@njit(inline="always")
+def squareness(solids, solid, cosine):
+    """Cosine of the incidence on a border: of a ragged one, which has faces of all directions, no less than RAGGED."""
+    return max(abs(cosine), 0.02 if solids.mirrors[solid] else RAGGED)
+
+
 @kernel
 def _through_border(solids, tissues, pose, point, here, there):
-    """Share of the amplitude that passes a border, there and back, and tangent by which the line turns along the array."""
-    nx, ny, nz = normal_at(solids, max(here, there) - 1, point[0], point[1], point[2])
+    """Share of the amplitude that passes a border, there and back, and tangent by which the line turns along the array.
+
+    A sheet is thinner than a wave: it turns and reflects nothing.
+    """
+    solid = max(here, there) - 1
+    if is_sheet(solids, solid):
+        return 1.0, 0.0
+    nx, ny, nz = normal_at(solids, solid, point[0], point[1], point[2])
     cosine = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
-    square = max(abs(cosine), 0.02)
+    square = squareness(solids, solid, cosine)
     speed = tissues.speed[here], tissues.speed[there]
     r = reflection(tissues.impedance[here], tissues.impedance[there], speed[0], speed[1], square)
     along = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) * (1.0 if cosine > 0 else -1.0)

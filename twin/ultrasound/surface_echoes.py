@@ -281,7 +281,7 @@ def _facet(ray, y, solids, solid, pose):
     return depth, square, slope_x, slope_z
 
 
-@njit
+@kernel
 def _label_on(ray, solids, t):
     """Label at a depth of a ray."""
     return label_at(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)

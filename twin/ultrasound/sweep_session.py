@@ -114,10 +114,10 @@ def surface_of(name: str, body: Body) -> Solid:
     InputError
         If there is no such solid.
     """
-    named = {solid.name: solid for solid in body.solids}
+    named = {solid.name: solid for solid in body.solids if not solid.is_layer}
     if name in named:
         return named[name]
-    others = [solid for solid in body.solids if solid.name not in SUPPORTS]
+    others = [solid for name, solid in named.items() if name not in SUPPORTS]
     if not named:
         raise InputError("path.surface: expected a scene of solid things, found one without")
     if name:

@@ -82,6 +82,21 @@ class Transducer(Part):
             raise ValueError(f"image_size: expected an image deeper than the face's arc by 1 mm or more, found {found}")
         return self
 
+    @model_validator(mode="after")
+    def _looks(self) -> "Transducer":
+        if self.aperture_rays % 2 == 0:
+            raise ValueError(f"aperture_rays: expected an odd number, with one ray in the middle, found {self.aperture_rays}")
+        for name, several in (("aperture_rays", self.aperture_rays > 1), ("picture.angles", self.picture.angles > 1)):
+            if several and self.face is not None:
+                raise ValueError(f"{name}: expected 1 for an array that isn't linear, found more")
+        most = np.rad2deg(np.arcsin(min(self.wavelength_mm / (4 * self.scale_mm_per_px[0]), 1.0)))
+        if self.picture.angles > 1 and self.picture.steered_deg >= most:
+            raise ValueError(
+                f"picture.steered_deg: expected less than {most:.1f} for lines {self.scale_mm_per_px[0]:g} mm apart, "
+                f"beyond which echoes are those of the other side, found {self.picture.steered_deg:g}"
+            )
+        return self
+
     @property
     def face(self) -> Any:
         """The `Face` of an array that isn't linear; None of a linear one."""

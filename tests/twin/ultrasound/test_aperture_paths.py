@@ -103,3 +103,9 @@ def test_a_ragged_layer_spoils_the_focus():
         things.append((replace(thing, name=f"plate{k}"), Tissue(1.5, 1450.0, 0.0, None)))
     found = paths(*things)
     assert found.focus[MIDDLE - 20 : MIDDLE + 20, 200].mean() < 0.5
+
+
+def test_without_refraction_nothing_is_shifted():
+    still = ARRAY.model_copy(update={"refraction": False})
+    found = paths((slab(10.0, 80.0, 8.0), Tissue(1.5, 1480.0, 0.0, None)), array=still)
+    assert np.abs(found.shift_mm).max() == 0
