@@ -18,6 +18,7 @@ many, and warns of none.
     sonotwin sweep out=outputs/sweep
     sonotwin sweep conditions=lifelike out=outputs/sweep
     sonotwin sweep filmed=true clocks.camera_hz=20 out=outputs/filmed
+    sonotwin sweep scene=patient ultrasound=clinic out=outputs/patient
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
