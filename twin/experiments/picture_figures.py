@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.ndimage import gaussian_filter
-from scipy.stats import skew
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def measure(image: NDArray[np.uint8], mm_per_px: tuple[float, float]) -> Picture
         float(growth),
         float(np.median(contrast)) if contrast else np.nan,
         float(lit.mean()),
-        float(skew(lit)),
+        float(stats.skew(lit)),
         float(far / near),
         float(slow.std() / slow.mean()),
         histogram / histogram.sum(),
