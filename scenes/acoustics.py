@@ -23,13 +23,9 @@ TISSUES = {
     "gel": Tissue(
         1.55, 1520.0, 0.02, None, soft=True
     ),  # coupling gel: water with a few per cent of polymer; assumed between water and tissue
-    "silicone": Tissue(
-        1.50, 1450.0, 0.6, 2.0, 0.01, True
-    ),  # body of a soft breast phantom: fat to gland [A, C], adipose speed 1450
+    "silicone": Tissue(1.50, 1450.0, 0.6, 2.0, 0.01, True),  # a soft breast phantom: fat to gland [A, C], adipose speed 1450
     "tumour": Tissue(1.58, 1530.0, 0.9, -12.0, 0.02, True),  # masses are darker, stiffer, faster and absorb more [A]
-    "gelatin": Tissue(
-        1.60, 1540.0, 0.5, 0.0, 0.005, True
-    ),  # tissue-mimicking gelatin or agar with graphite [C], made for 1540 m/s
+    "gelatin": Tissue(1.60, 1540.0, 0.5, 0.0, 0.005, True),  # gelatin or agar with graphite, like tissue [C], made for 1540 m/s
     "cyst": Tissue(1.57, 1540.0, 0.05, None, 0.005, True),  # fluid, matched in speed
     "bright": Tissue(1.61, 1540.0, 0.5, 6.0, 0.005, True),  # inclusions of a grey-scale test object
     "dark": Tissue(1.59, 1540.0, 0.5, -6.0, 0.005, True),
@@ -39,13 +35,9 @@ TISSUES = {
     "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
     "skin": Tissue(1.72, 1555.0, 1.84, 8.0, 0.03, True),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; bright, assumed
-    "fat": Tissue(
-        1.31, 1440.0, 0.73, 0.0, 0.03, True
-    ),  # 911 kg/m3, 1440 m/s [L]; attenuation of 0.73 at 7 MHz [F]; its echo is the reference of BI-RADS
+    "fat": Tissue(1.31, 1440.0, 0.73, 0.0, 0.03, True),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
     "ligament": Tissue(1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
-    "gland": Tissue(
-        1.60, 1540.0, 0.75, 10.0, 0.02, True
-    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; ten times the backscatter of fat [A]
+    "gland": Tissue(1.60, 1540.0, 0.75, 10.0, 0.02, True),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 10 times the echo of fat [A]
     "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True),  # fluid and walls, assumed
     "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True),  # dense connective tissue that shadows, assumed
     "muscle": Tissue(1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed

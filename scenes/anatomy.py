@@ -80,7 +80,7 @@ class Grid(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Grown:
+class GrownBreast:
     """Tissues of a breast in its frame."""
 
     grid: Grid
@@ -89,7 +89,7 @@ class Grown:
     depth: Volume  # mm under the skin
 
 
-def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> Grown:
+def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
     """Grow the tissues under a skin that stands on the chest's plane."""
     low, high = skin.vertices.min(axis=0), skin.vertices.max(axis=0)
     first = np.array([*(low[:2] - MARGIN_MM), -CHEST_MM])
@@ -129,7 +129,7 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> Grown:
     spread_db = anatomy.uneven_db * np.where(streaky, 2.0, 1.0)
     uneven = spread_db * np.where(streaky, (2 * strands + coarse) / np.sqrt(5), (strands + coarse) / np.sqrt(2))
     uneven -= np.log(10) / 20 * spread_db**2  # so that the mean power is the tissue's
-    return Grown(grid, tuple(layers), uneven.astype(np.float32), depth)
+    return GrownBreast(grid, tuple(layers), uneven.astype(np.float32), depth)
 
 
 def in_world(layer: Volume, grid: Grid, world_from_phantom: Array) -> tuple[Volume, Array]:

@@ -16,7 +16,7 @@ from twin.experiments.experiment_setup import Figures, Setup
 from twin.experiments.picture_figures import PictureFigures, divergence, measure
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
+from twin.ultrasound.probe_path import Hand, Hold, resting
 from twin.ultrasound.sweep_session import surface_of
 from twin.ultrasound.transducer import Transducer
 
@@ -48,7 +48,7 @@ def views(array: Transducer, seed: int) -> list[PictureFigures]:
     breast = body(build_scene({"kind": "patient", "seed": seed, "edge_mm": 1.5}))
     skin, found = surface_of("breast", breast), []
     for number, (x, y) in enumerate(PLACES):
-        pose = along_surface(SurfacePath(start_mm=(x, y), end_mm=(x + 0.5, y), hand=STILL), skin, array, 1).poses[0]
+        pose = resting(Hold(place_mm=(x, y), hand=STILL), skin, array, 1).poses[0]
         turned = pose @ rigid.transform(np.eye(3), (0, 0, 0.1 * seed))
         found.append(measure(scan(breast, array, turned, seed, number).image, array.scale_mm_per_px))
     return found

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import gaussian_filter
+from scipy.spatial.distance import jensenshannon
 
 Array = NDArray[np.float64]
 
@@ -71,13 +72,7 @@ def measure(image: NDArray[np.uint8], mm_per_px: tuple[float, float]) -> Picture
 
 def divergence(first: Array, second: Array) -> float:
     """Jensen-Shannon divergence of two histograms, in bits."""
-    middle = (first + second) / 2
-
-    def from_middle(shares: Array) -> float:
-        there = shares > 0
-        return float((shares[there] * np.log2(shares[there] / middle[there])).sum())
-
-    return (from_middle(first) + from_middle(second)) / 2
+    return float(jensenshannon(first, second, base=2) ** 2)
 
 
 def _widths(patch: Array) -> tuple[float, float]:

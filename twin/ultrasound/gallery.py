@@ -17,10 +17,11 @@ from scenes.anatomy import GLANDULAR
 from scenes.catalogue import build_scene
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
+from twin.ultrasound.probe_path import Hand, Hold, resting
 from twin.ultrasound.sweep_session import surface_of
 from twin.ultrasound.transducer import Transducer
 
+STILL = Hand(shift_mm=0, turn_deg=0)
 TISSUE = Transducer()
 WATER = Transducer(tgc_db_per_cm_mhz=0.0165, gain_db=-40.0)  # conf/ultrasound/water.yaml
 MASSES = {"27 mm": (-10.0, -8.0), "14 mm": (28.0, -24.0), "12 mm": (26.0, 26.0)}  # x, y of the breast's tumours
@@ -44,8 +45,7 @@ def _bscans() -> dict[str, NDArray[np.uint8]]:
     breast = body(build_scene({"kind": "breast"}))
     images = {}
     for size, (x, y) in MASSES.items():
-        still = SurfacePath(start_mm=(x, y), end_mm=(x + 0.5, y), hand=Hand(shift_mm=0, turn_deg=0))
-        pose = along_surface(still, surface_of("breast", breast), TISSUE, 1).poses[0]
+        pose = resting(Hold(place_mm=(x, y), hand=STILL), surface_of("breast", breast), TISSUE, 1).poses[0]
         images[f"breast, tumour of {size}"] = scan(breast, TISSUE, pose, 1).image
     for title, kind, array, face, along in STATIONS:
         axes = np.column_stack([along, [0, 0, 1], np.cross(along, [0, 0, 1])])
@@ -58,11 +58,9 @@ def _patients(scanner: Path) -> dict[str, NDArray[np.uint8]]:
     """B-scans of breasts of all densities, and of masses, by title, as a scanner shows them."""
     array, images = Transducer(**yaml.safe_load(scanner.read_text(encoding="utf-8"))), {}
     for seed, density in enumerate(GLANDULAR):
-        made = build_scene({"kind": "patient", "seed": 7 + seed, "anatomy": {"density": density}})
-        breast = body(made)
+        breast = body(build_scene({"kind": "patient", "seed": 7 + seed, "anatomy": {"density": density}}))
         for title, (x, y) in PATIENTS[density].items():
-            still = SurfacePath(start_mm=(x, y), end_mm=(x + 0.5, y), hand=Hand(shift_mm=0, turn_deg=0))
-            pose = along_surface(still, surface_of("breast", breast), array, 1).poses[0]
+            pose = resting(Hold(place_mm=(x, y), hand=STILL), surface_of("breast", breast), array, 1).poses[0]
             images[f"{density}, {title}"] = scan(breast, array, pose, 7 + seed).image
     return images
 

@@ -15,10 +15,11 @@ from twin.reports.sweep_pictures import tissue_speed
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.bscan_truth import labels
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.probe_path import Hand, SurfacePath, along_surface
+from twin.ultrasound.probe_path import Hand, Hold, resting
 from twin.ultrasound.sweep_session import surface_of
 from twin.ultrasound.transducer import Transducer
 
+STILL = Hand(shift_mm=0, turn_deg=0)
 OVER_CYST = (32.0, -27.0)  # x, y of the face's middle, of which the image meets the cyst
 
 
@@ -34,8 +35,7 @@ def clinic():
 
 @pytest.fixture(scope="module")
 def pose(breast, clinic):
-    path = SurfacePath(start_mm=OVER_CYST, end_mm=(OVER_CYST[0] + 0.5, OVER_CYST[1]), hand=Hand(shift_mm=0, turn_deg=0))
-    return along_surface(path, surface_of("breast", breast), clinic, 1).poses[0]
+    return resting(Hold(place_mm=OVER_CYST, hand=STILL), surface_of("breast", breast), clinic, 1).poses[0]
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +85,7 @@ def test_calcifications_stay_where_they_are():
     cyst = {"size_mm": 20, "centre_mm": [-16, 8, 25], "form": "round", "pattern": "anechoic", "calcified": True}
     fields = {"seed": 8, "edge_mm": 2.0, "anatomy": {"voxel_mm": 2.0}, "masses": [cyst]}
     calcified, array = body(build_scene({"kind": "patient", **fields})), Transducer(noise_db=-200.0)
-    path = SurfacePath(start_mm=(-12.0, -16.0), end_mm=(-11.5, -16.0), hand=Hand(shift_mm=0, turn_deg=0))
-    pose = along_surface(path, surface_of("breast", calcified), array, 1).poses[0]
+    pose = resting(Hold(place_mm=(-12.0, -16.0), hand=STILL), surface_of("breast", calcified), array, 1).poses[0]
     first, second = (scan(calcified, array, pose @ rigid.transform(np.eye(3), (0, 0, aside)), 3) for aside in (0.0, 0.1))
     mass = shown(calcified, array, first) == "mass0"
     inside = mass & np.roll(mass, 12, axis=0) & np.roll(mass, -12, axis=0)
