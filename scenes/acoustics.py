@@ -5,7 +5,9 @@ tissue substitutes for ultrasound imaging, Ultrasound Med. Biol. 36(6); [K] Kaye
 [M] Marczak 1997 (water); [A] D'Astous & Foster 1986, Ultrasound Med. Biol. 12(10) (breast tissue). Those of a patient at body
 temperature: [L] Li, Villa, Park & Anastasio 2022, IEEE Trans. UFFC 69(1) (speed and density of breast tissues, from IT'IS and
 measured tumours); [F] Nasief et al. 2015, J. Ultrasound Med. 34(11) (attenuation and backscatter of breast fat); [N] Nam et al.
-2013, Ultrason. Imaging 35(2) (masses); [I] Hasgall et al., IT'IS tissue data base 4.1.
+2013, Ultrason. Imaging 35(2) (masses); [I] Hasgall et al., IT'IS tissue data base 4.1. Young's moduli: fat 3.25
+and gland 3.24 kPa [Samani, Zubovits & Plewes 2007, Phys. Med. Biol. 52(6)], others assumed: skin, ligaments and fascia some 20
+times as stiff, a phantom's tumours thrice as its rest.
 """
 
 from dataclasses import replace
@@ -23,8 +25,12 @@ TISSUES = {
     "gel": Tissue(
         1.55, 1520.0, 0.02, None, soft=True
     ),  # coupling gel: water with a few per cent of polymer; assumed between water and tissue
-    "silicone": Tissue(1.50, 1450.0, 0.6, 2.0, 0.01, True),  # a soft breast phantom: fat to gland [A, C], adipose speed 1450
-    "tumour": Tissue(1.58, 1530.0, 0.9, -12.0, 0.02, True),  # masses are darker, stiffer, faster and absorb more [A]
+    "silicone": Tissue(
+        1.50, 1450.0, 0.6, 2.0, 0.01, True, modulus_kpa=30.0
+    ),  # a soft breast phantom: fat to gland [A, C], adipose speed 1450
+    "tumour": Tissue(
+        1.58, 1530.0, 0.9, -12.0, 0.02, True, modulus_kpa=90.0
+    ),  # masses are darker, stiffer, faster and absorb more [A]
     "gelatin": Tissue(1.60, 1540.0, 0.5, 0.0, 0.005, True),  # gelatin or agar with graphite, like tissue [C], made for 1540 m/s
     "cyst": Tissue(1.57, 1540.0, 0.05, None, 0.005, True),  # fluid, matched in speed
     "bright": Tissue(1.61, 1540.0, 0.5, 6.0, 0.005, True),  # inclusions of a grey-scale test object
@@ -32,17 +38,25 @@ TISSUES = {
     "polymer": Tissue(3.2, 2700.0, 1.4, None, 0.001),  # acrylic glass, nylon and their like [K]
     "sanded": Tissue(3.2, 2700.0, 1.4, None, 0.03),  # the same, sanded or under matt paint: it scatters to all sides; assumed
     "steel": Tissue(46.0, 5900.0, 0.2, None, 0.002),  # [K]
-    "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
+    "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03, modulus_kpa=1e7),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
-    "skin": Tissue(1.72, 1555.0, 1.84, 8.0, 0.03, True),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; bright, assumed
-    "fat": Tissue(1.31, 1440.0, 0.73, 0.0, 0.03, True),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
-    "ligament": Tissue(1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
-    "gland": Tissue(1.60, 1540.0, 0.75, 10.0, 0.02, True),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 10 times the echo of fat [A]
-    "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True),  # fluid and walls, assumed
-    "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True),  # dense connective tissue that shadows, assumed
-    "muscle": Tissue(1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
-    "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0),  # as ligaments and tendons [I]; echoes assumed
-    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05),  # 1908 kg/m3, 3515 m/s, attenuation [I]
+    "skin": Tissue(
+        1.72, 1555.0, 1.84, 10.0, 0.03, True, modulus_kpa=60.0
+    ),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; bright, assumed
+    "fat": Tissue(1.31, 1440.0, 0.73, 0.0, 0.04, True),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
+    "ligament": Tissue(
+        1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0, modulus_kpa=60.0
+    ),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
+    "gland": Tissue(
+        1.60, 1540.0, 0.75, 10.0, 0.02, True, modulus_kpa=3.24
+    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 10 times the echo of fat [A]
+    "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True, modulus_kpa=3.24),  # fluid and walls, assumed
+    "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True, modulus_kpa=15.0),  # dense connective tissue that shadows, assumed
+    "muscle": Tissue(
+        1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0, modulus_kpa=10.0
+    ),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
+    "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0, modulus_kpa=60.0),  # as ligaments and tendons [I]; echoes assumed
+    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05, modulus_kpa=1e7),  # 1908 kg/m3, 3515 m/s, attenuation [I]
     "lung": Tissue(0.37, 949.0, 20.0, None, 0.05),  # 394 kg/m3, 949 m/s [I]: it lets nothing back
 }
 

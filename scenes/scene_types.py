@@ -59,6 +59,7 @@ class Thing:
     smooth: bool = True  # interpolated vertex normals (curved), or flat faces
     inside: bool = False  # hidden within another thing: optics leave it out, ultrasound sees it
     tissue: Tissue | None = None  # for ultrasound; else its name tells it, see `scenes.acoustics`
+    mirrors: bool = True  # for ultrasound: whether its border is even enough for an echo of its own
     primitive: Sphere | None = None  # the exact shape that the mesh approximates, for a renderer that has one
 
     def __post_init__(self) -> None:

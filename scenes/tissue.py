@@ -21,9 +21,12 @@ class Tissue:
     soft: bool = False  # whether its speed goes with that of all soft tissue
     fibres_db: float = 0.0  # by which a layer of fibres is brighter where sound meets it squarely
     specks_per_mm3: float = 0.0  # calcifications
+    modulus_kpa: float = 3.25  # Young's, at small strains
 
     def __post_init__(self) -> None:
         if not (self.impedance > 0 and self.speed > 0):
             raise ValueError(f"impedance and speed: expected more than 0, found {self.impedance} and {self.speed}")
+        if not self.modulus_kpa > 0:
+            raise ValueError(f"modulus_kpa: expected more than 0, found {self.modulus_kpa}")
         if self.attenuation < 0 or self.roughness < 0:
             raise ValueError(f"attenuation and roughness: expected 0 or more, found {self.attenuation} and {self.roughness}")

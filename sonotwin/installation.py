@@ -28,6 +28,7 @@ MODULES = {  # where a package isn't imported by the name that it is installed b
     "pytest-xdist": "xdist",
     "pillow": "PIL",
     "pyyaml": "yaml",
+    "scikit-fem": "skfem",
     "scikit-image": "skimage",
 }
 BROUGHT_BY = {

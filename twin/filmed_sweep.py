@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -16,6 +17,8 @@ from scenes.catalogue import build_scene
 from scenes.scene_types import Scene
 from twin import swept_bodies
 from twin.conditions import Conditions, in_use
+from twin.displacement import NOWHERE, Displacement
+from twin.living.living_body import Living, LivingSweep, living_body
 from twin.shooting import FrameShooting
 from twin.swept_bodies import SweptBody
 from twin.tracking.led_bodies import LedBodies, check_names
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
     from twin.tracking.scene_frames import SceneFilm
 
 Array = NDArray[np.float64]
+GIVES_MM, MOST_PRESSED_MM = 5.0, 15.0  # by which the face may get into a solid: one that keeps its form, and one that yields
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
 
 
@@ -63,6 +67,7 @@ class SweepSettings(LedBodies):
     name: SweepNameOrNone = ""
     filmed: bool = False
     moved: Moved = Moved()
+    living: Living = Living()
     frames: FrameShooting = FrameShooting()
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -88,6 +93,12 @@ class SweepSettings(LedBodies):
                 "moved: expected filmed=true with it, found filmed=false: `sonotwin track` takes it out of the poses "
                 "that it finds in frames, and nothing takes it out of given ones"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _lives_on_a_surface(self) -> "SweepSettings":
+        if self.living != Living() and self.path.kind not in ("stroke", "hold"):
+            raise ValueError(f"living: expected a path over a surface, such as stroke, found {self.path.kind}; give living=still")
         return self
 
     @model_validator(mode="after")
@@ -121,13 +132,34 @@ class PlannedSweep:
     plan: Plan
     bodies: Mapping[str, SweptBody]  # of the rig, besides the probe
     world_from_reference: Array  # (4, 4) mm, by which the patient has moved
+    living: LivingSweep | None = None  # a body that lives; images and tracks are then told in the world
+
+    @property
+    def body_from_image(self) -> Array:
+        """Poses : (n, 4, 4) of the images in the body's frame, in which it rests."""
+        truth = self.plan.truth
+        return truth.poses if self.living is None else self.living.body_from_image(truth.times, truth.poses)
+
+    def field(self, number: int) -> Displacement:
+        """Displacement of the body from its rest, in its own frame, when an image is taken."""
+        if self.living is None:
+            return NOWHERE
+        return self.living.field(int(self.plan.truth.times[number]), self.body_from_image[number])
+
+    def truth(self) -> dict[str, Array]:
+        """Truth of a body that lives; see `LivingSweep.truth`."""
+        assert self.living is not None
+        return self.living.truth(self.plan.truth.times, self.plan.truth.poses)
 
     def scans(self) -> Iterator[Scan]:
         """Render the B-scans, one by one."""
         seed = int(np.random.SeedSequence([self.settings.seed, 1]).generate_state(1)[0])
         shafts = [(shaft, body.scanned.poses) for body in self.bodies.values() if (shaft := body.shaft) is not None]
         tools = [[Tool(shaft.moved(poses[k])) for shaft, poses in shafts] for k in range(len(self.plan.times))]
-        return scans(self.scanned, self.settings.ultrasound, self.plan.truth.poses, seed, tools)
+        poses, times = self.body_from_image, self.plan.truth.times.tolist()
+        living = self.living
+        field = None if living is None else (lambda k: living.field(times[k], poses[k]))
+        return scans(self.scanned, self.settings.ultrasound, poses, seed, tools, field)
 
     def film(self, ranges: DataRanges, shown: Shown = lambda frames, _: frames) -> "SceneFilm":
         """The film of the sweep: light, body and motion of its frames, and their rendering.
@@ -167,6 +199,9 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     """
     scene = build_scene(settings.scene)
     scanned = at_speeds(body(scene), settings.conditions.sound, settings.seed)
+    living = None
+    if settings.living != Living():
+        living = living_body(settings.living, scanned, getattr(settings.path, "surface", ""), settings.own_seed)
     plan = sweep_session.plan_sweep(
         settings.path,
         settings.rig,
@@ -176,6 +211,8 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
         settings.pose_noise,
         settings.own_seed,
         settings.conditions.motion,
+        None if living is None else partial(living.world_from_body, share=settings.living.follows),
+        MOST_PRESSED_MM if settings.living.yields else GIVES_MM,
     )
     bodies = swept_bodies.lead(
         settings,
@@ -192,7 +229,8 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     bodies = {
         name: replace(one, track=_carried(one.track, moved), truth=_carried(one.truth, moved)) for name, one in bodies.items()
     }
-    return PlannedSweep(settings, scene, scanned, plan, bodies, moved)
+    swept = None if living is None else LivingSweep(living, settings.ultrasound, plan.target.path)
+    return PlannedSweep(settings, scene, scanned, plan, bodies, moved, swept)
 
 
 def _carried(track: Track, world_from_reference: Array) -> Track:

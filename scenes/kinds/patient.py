@@ -42,6 +42,10 @@ ECHOES: dict[Pattern, float | None] = {
 """dB over fat, the reference of BI-RADS; carcinomas and fibroadenomas of Nam et al. 2013 lie 2 to 12 dB below the gland"""
 LOSSES: dict[Behind, float] = {"none": 0.8, "enhancement": 0.3, "shadow": 2.2}
 """dB/cm/MHz; what lies above and beside a mass loses some 0.75"""
+CIRCUMSCRIBED: tuple[MassForm, ...] = ("round", "oval", "lobulated")
+"""forms with an even border, which shines where sound meets it squarely; others have no rim"""
+MODULI: dict[Pattern, float] = {"anechoic": 1.0, "hypoechoic": 16.0, "isoechoic": 6.4, "hyperechoic": 3.25, "complex": 2.0}
+"""kPa: carcinomas 10 to 42, fibroadenomas 6.4 [Samani et al. 2007]; cysts assumed, lipomas as fat"""
 SPEEDS: dict[Pattern, float] = {
     "anechoic": 1530.0,
     "hypoechoic": 1550.0,
@@ -73,7 +77,16 @@ class Mass(Part):
         speed = SPEEDS[self.pattern]
         density = 1.0 if self.pattern in ("anechoic", "complex") else 1.04
         specks = 0.02 if self.calcified else 0.0
-        return Tissue(1e-3 * density * speed, speed, loss, ECHOES[self.pattern], 0.03, soft=True, specks_per_mm3=specks)
+        return Tissue(
+            1e-3 * density * speed,
+            speed,
+            loss,
+            ECHOES[self.pattern],
+            0.012,
+            soft=True,
+            specks_per_mm3=specks,
+            modulus_kpa=MODULI[self.pattern],
+        )
 
 
 class Config(Outside):
@@ -118,7 +131,8 @@ def build(config: Config) -> Scene:
     for k, (wanted, rng) in enumerate(zip(config.masses, mass_rng.spawn(len(config.masses)), strict=True)):
         body = solid_meshes.moved(mass(wanted.form, wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
         check_depth(f"masses.{k}", body, skin, config.least_mm)
-        things.append(Thing(f"mass{k}", solid_meshes.moved(body, world), Material(0.3), inside=True, tissue=wanted.tissue()))
+        placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
+        things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
     return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world))

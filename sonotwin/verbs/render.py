@@ -9,10 +9,14 @@ With `add=true` other parts of a capture in OUT stay, such as a board, a sweep; 
 With a rig that has a body `patient`, or others that stand, such as three_bodies, their boards stand beside the scene, so that
 `sonotwin track` knows where the patient was under the fringes: render both cameras.
 
+With `living=patient` she breathes and her heart beats while the images are taken, one after the other; the truth is that of her
+rest. Takes as long for each image as for all of a scene that is still.
+
 With `poses` the scene is the calibration board, held in many poses: lit for each camera, and under the patterns for camera 1.
 Takes about eight seconds a pose on two cores. A run that was stopped goes on where it was when given the same fields again.
 
     sonotwin render scene=sphere patterns=gray_surface out=outputs/sphere
+    sonotwin render scene=patient living=patient out=outputs/breathing
     sonotwin render scene=board poses=paper patterns=paper_calibration cameras=[cam1,cam2] out=outputs/board
 """
 
@@ -20,6 +24,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
@@ -35,11 +40,13 @@ from scenes.scene_types import Scene
 from sonotwin.console_watch import LineConsole
 from twin import board_session
 from twin.conditions import IDEAL, Conditions, check_board, in_use
+from twin.living.living_body import STILL, Living, living_body, scenes_at
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.session import Session
 from twin.standing_bodies import with_standing
 from twin.tracking.led_bodies import LedBodies, check_names
+from twin.ultrasound.echo_solids import body
 from twin.working_range import working_range
 
 
@@ -57,6 +64,8 @@ class Config(LedBodies):
     shooting: surface_session.Shooting
     poses: BoardPoses | None = None
     conditions: Conditions = IDEAL
+    living: Living = STILL
+    images_hz: Annotated[float, Field(gt=0, le=10_000)] = 20.0
 
     @model_validator(mode="after")
     def _fits(self) -> "Config":
@@ -80,6 +89,8 @@ class Config(LedBodies):
     def _fits_poses(self) -> "Config":
         if self.poses is None:
             return self
+        if self.living != STILL:
+            raise ValueError("living: expected none of it with poses of a board, found some; give living=still")
         if self.scene.get("kind") != "board":
             raise ValueError(f"poses: expected scene=board with them, found scene.kind {self.scene.get('kind')}")
         check_board(parse_scene(self.scene)[1], self.conditions.board)
@@ -168,12 +179,16 @@ def render_surface(config: Config, session: Session, console: Console) -> None:
     """Render each camera's images of the scene under the patterns."""
     session.check()
     rig, scene, standing = set_up(config)
-    views = {}
+    views, moments = {}, []
+    if config.living != STILL:
+        with console.status("moving the scene"):
+            times = np.rint(np.arange(config.patterns.count) * 1e9 / config.images_hz).astype(np.int64)
+            moments = scenes_at(scene, living_body(config.living, body(build_scene(config.scene)), "", config.seed), times)
     for camera in dict.fromkeys(config.cameras):
         start = perf_counter()
         with console.status(f"rendering {config.patterns.count} patterns for {camera}"):
             view = surface_session.shoot(
-                rig, scene, config.patterns, camera, config.tracing, config.shooting, config.seed, config.conditions
+                rig, scene, config.patterns, camera, config.tracing, config.shooting, config.seed, config.conditions, moments
             )
         views[camera] = view
         console.print(

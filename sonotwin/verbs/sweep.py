@@ -11,6 +11,10 @@ With `filmed=true` both cameras film the sweep, too: the rig's board, bracket an
 are then in these frames, for `sonotwin track`, and nowhere else. Takes about a second a pair of frames more. Frames show further
 bodies of the rig, too. With `moved` the patient, the scene and all over it, has moved by a rigid step since the fringes.
 
+With `living=patient` she breathes, her heart beats, and soft tissue yields to the probe; her position at rest, at the end of an
+expiration, is that of the fringes. OUT/truth then also holds living.npz: where chest and masses were at each image, and where
+the points that its pixels show rest.
+
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
 B-scans that they are led to. Poses are found where both cameras have the body's target in view: a line for each body says in how
 many, and warns of none.
@@ -19,6 +23,7 @@ many, and warns of none.
     sonotwin sweep conditions=lifelike out=outputs/sweep
     sonotwin sweep filmed=true clocks.camera_hz=20 out=outputs/filmed
     sonotwin sweep scene=patient ultrasound=clinic out=outputs/patient
+    sonotwin sweep scene=patient ultrasound=clinic living=patient path.standoff_mm=-2 out=outputs/pressed
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
@@ -94,6 +99,7 @@ def run(config: Config) -> None:
         probe,
         film,
         planned.bodies,
+        planned.truth if planned.living else None,
     )
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size

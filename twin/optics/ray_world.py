@@ -39,6 +39,16 @@ def move_things(world: mi.Scene, things: Sequence[Thing], to_from: rigid.Array) 
     parameters.update()
 
 
+def reshape_things(world: mi.Scene, scene: Scene) -> None:
+    """Give the meshes of a world, built from another moment of a scene, the form that they have in this one."""
+    parameters, things = mi.traverse(world), visible(scene)
+    for key, thing in zip(named(things), things, strict=True):
+        parameters[f"{key}.vertex_positions"] = np.float32(thing.mesh.vertices).ravel()
+        if thing.smooth:
+            parameters[f"{key}.vertex_normals"] = np.float32(thing.mesh.vertex_normals).ravel()
+    parameters.update()
+
+
 def named_shapes(scene: Scene) -> dict[str, mi.Shape]:
     """The visible things as shapes, under names that keep their order."""
     things = visible(scene)

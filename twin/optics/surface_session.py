@@ -1,10 +1,11 @@
 """The surface part of a session: images of a scene under a pattern sequence, and their truth."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Annotated, Literal
 
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -20,7 +21,8 @@ from twin.conditions import IDEAL, Conditions, as_skin, draw
 from twin.optics.disturbed_light import emitted, with_stray
 from twin.optics.instruments import CameraOptics, ProjectorOptics
 from twin.optics.light_transport import Images, Tracing, render
-from twin.optics.ray_world import build_world, translucent, visible
+from twin.optics.raster import Light
+from twin.optics.ray_world import build_world, reshape_things, translucent, visible
 from twin.optics.surface_truth import SurfaceTruth, surface_truth
 from twin.sensor import Exposure, Numbers, auto_exposure, electrons_per_radiance, expose, noise_dn, number_per_electron
 from twin.session import Session, describe
@@ -56,11 +58,14 @@ def shoot(
     shooting: Shooting,
     seed: int,
     conditions: Conditions = IDEAL,
+    moments: Sequence[Scene] = (),
 ) -> View:
     """Render a camera's view of a pattern sequence, and take the images with its sensor.
 
     The same seed gives the same bytes. Rendering noise, sensor noise and the two cameras draw from separate streams; errors of
     frames are the same for both cameras.
+
+    moments : (n,) the scene as it is in each of the images, where it moves; the truth is that of `scene`.
     """
     arguments.of_kind("render: rig", rig, Rig, way="sonotwin.read_rig reads one by name or file")
     arguments.of_kind("render: scene", scene, Scene, way="sonotwin.build_scene builds one")
@@ -77,7 +82,17 @@ def shoot(
     world, projector = build_world(scene), ProjectorOptics.of(rig.projector)
     frames = draw(conditions.frames, patterns.count, seed)
     light = emitted(patterns, rig.projector, frames)
-    radiance = render(world, optics, projector, light, tracing, light_seed, translucent(scene, world))
+    spreading = translucent(scene, world)
+    if moments:
+        radiance = np.concatenate(
+            [
+                render(_at_moment(one, world), optics, projector, _of_one(light, k), tracing, light_seed, spreading)
+                for k, one in enumerate(moments)
+            ]
+        )
+        reshape_things(world, scene)
+    else:
+        radiance = render(world, optics, projector, light, tracing, light_seed, spreading)
     wavelength = rig.projector.wavelength_nm
     time_s = shooting.exposure_s or auto_exposure(radiance, device, wavelength, level=shooting.level / shooting.gain)
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
@@ -87,6 +102,16 @@ def shoot(
         surface_truth(world, device.optics.camera(), rig.projector.optics.camera()),
         noise_limit_px(radiance, patterns, device, wavelength, exposure),
     )
+
+
+def _at_moment(moment: Scene, world: mi.Scene) -> mi.Scene:
+    reshape_things(world, moment)
+    return world
+
+
+def _of_one(light: Light, number: int) -> Light:
+    """The light of one of the patterns."""
+    return replace(light, axes=light.axes[number : number + 1], profiles=light.profiles[number : number + 1])
 
 
 def camera_optics(rig: Rig, camera: CameraName) -> CameraOptics:

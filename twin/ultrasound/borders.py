@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
-from twin.ultrasound.echo_solids import Body, distance_at
+from twin.ultrasound.echo_solids import Body, resting_distance, resting_place, shrinking
 from twin.ultrasound.scan_lines import Lines, widening, world_from_lines
 
 Array = NDArray[np.float64]
@@ -104,11 +104,12 @@ def _fill(first, end, spans, solids, bundles, clear, side):
 def _borders_near(clear, side, solids, point, t, radius_mm):
     """Whether a border may lie in a bundle at a depth, and the depth up to which none may; keeps the solids' sides."""
     met, free = False, np.inf
+    x, y, z = resting_place(solids, point[0], point[1], point[2])
     for solid in range(len(clear)):
         if not solids.mirrors[solid]:
             side[solid], clear[solid] = OUTSIDE, np.inf
         elif clear[solid] < t + GROWTH_MM:
-            d = distance_at(solids, solid, point[0], point[1], point[2])
+            d = shrinking(solids) * resting_distance(solids, solid, x, y, z)
             side[solid] = NEAR if abs(d) <= radius_mm + GROWTH_MM else INSIDE if d < 0 else OUTSIDE
             clear[solid] = t + (GROWTH_MM if side[solid] == NEAR else min(abs(d) - radius_mm, LEAP_MM))
         met |= side[solid] == NEAR

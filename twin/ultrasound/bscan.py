@@ -1,12 +1,13 @@
 """B-scans of a scene, from poses: the front door of the B-mode model."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.threads import mapped
+from twin.displacement import Displacement
 from twin.ultrasound import bmode_image
 from twin.ultrasound.aperture_paths import over_aperture
 from twin.ultrasound.beam import beam
@@ -71,11 +72,19 @@ def _envelope(
 
 
 def scans(
-    scene: Body, transducer: Transducer, world_from_image: Array, seed: int, tools: Sequence[Sequence[Tool]] | None = None
+    scene: Body,
+    transducer: Transducer,
+    world_from_image: Array,
+    seed: int,
+    tools: Sequence[Sequence[Tool]] | None = None,
+    displaced: Callable[[int], Displacement] | None = None,
 ) -> Iterator[Scan]:
     """Take the B-scans of poses : (n, 4, 4) mm, numbered from 0, one a thread at a time; see `scan`.
 
+    Parameters
+    ----------
     tools : (n,) of each image
+    displaced : by which the scene has moved from its rest, by the image's number
     """
     poses = np.asarray(world_from_image)
     led = [()] * len(poses) if tools is None else tools
@@ -83,7 +92,8 @@ def scans(
     share = np.float32(transducer.picture.persistence)
 
     def take(pose: Array, frame: int, there: Sequence[Tool]) -> tuple[NDArray[np.float32], NDArray[np.float32], Paths]:
-        envelope, paths = _envelope(scene, transducer, pose, seed, frame, there)
+        lying = scene if displaced is None else scene.displaced(displaced(frame))
+        envelope, paths = _envelope(lying, transducer, pose, seed, frame, there)
         return bmode_image.shown(envelope, transducer), envelope, paths
 
     leap_mm = 5.0  # from one B-scan to the next, after which nothing of that before is kept

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from recon.compiled import kernel
 from recon.geometry import rigid
 from recon.threads import in_threads
+from twin.displacement import moved_to
 from twin.ultrasound import bmode_image
 from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.scan_lines import converted, lines_of, widening
@@ -45,7 +46,11 @@ def sections(body: Body, world_from_image: Array) -> dict[str, list[Array]]:
     A wire that crosses the plane gives the one point (1, 2) of its axis.
     """
     image_from_world = rigid.invert(world_from_image)
-    found = {solid.name: _outlines(solid.mesh, image_from_world) for solid in body.solids if not solid.is_layer}
+    found = {}
+    for solid in body.solids:
+        if not solid.is_layer:
+            places = moved_to(body.field, np.asarray(solid.mesh.vertices))
+            found[solid.name] = _outlines(trimesh.Trimesh(places, solid.mesh.faces, process=False), image_from_world)
     for wire in body.wires:
         ends = rigid.apply(image_from_world, wire.ends)
         if ends[0, 2] * ends[1, 2] < 0:

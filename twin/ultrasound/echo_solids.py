@@ -23,6 +23,7 @@ from scenes.scene_types import Layers, Scene, Thing
 from scenes.tissue import Tissue
 from twin import conditions
 from twin.conditions import Sound
+from twin.displacement import NOWHERE, Displacement, carried_back
 from twin.ultrasound.grown_layers import NONE, Grown, layer_at, layer_distance, packed
 from twin.ultrasound.mesh_distance import Grid, signed_distances
 
@@ -43,6 +44,7 @@ class Solids(NamedTuple):
     mirrors: NDArray[np.bool_]  # (n,) whether the border is even enough for an echo of its own
     layers: tuple[int, int]  # the first solid that is a layer, and the end
     grown: Grown  # the layers
+    field: Displacement  # by which all of them have moved from where the grids have them
 
 
 class Tissues(NamedTuple):
@@ -103,6 +105,7 @@ class Body:
     solids: tuple[Solid, ...]
     wires: tuple[Wire, ...]
     grown: Layers | None = None  # those of the solids that are layers
+    field: Displacement = NOWHERE  # by which all of it has moved from where its solids say
 
     @property
     def tissues(self) -> tuple[Tissue, ...]:
@@ -133,7 +136,14 @@ class Body:
             np.array([solid.mirrors for solid in self.solids], bool),
             (first, first + sum(solid.is_layer for solid in self.solids)),
             packed(self.grown),
+            self.field,
         )
+
+    def displaced(self, field: Displacement) -> "Body":
+        """The same body, displaced from its rest; wires stay."""
+        moved = replace(self, field=field)
+        moved.__dict__["_packed"] = self.packed()._replace(field=field)  # as the cached property would have it
+        return moved
 
     def acoustics(self, frequency_mhz: float) -> Tissues:
         """The tissues' figures at a frequency, for compiled code."""
@@ -212,11 +222,12 @@ def solid(thing: Thing, tissue: Tissue, shape: Cylinder | None) -> Solid:
     elif not thing.mesh.is_watertight:
         raise InputError(f"scene: {thing.name}: expected a closed mesh, found open edges; merge its vertices, or fill its holes")
     elif np.isclose(thing.mesh.volume, np.prod(thing.mesh.extents), rtol=1e-6):
-        return Solid(thing.name, tissue, np.zeros((0, 0, 0), np.float32), thing.mesh.bounds[0], steps, thing.mesh)
+        empty = np.zeros((0, 0, 0), np.float32)
+        return Solid(thing.name, tissue, empty, thing.mesh.bounds[0], steps, thing.mesh, mirrors=thing.mirrors)
     else:
         grid = _grid(thing, steps)
         distance = signed_distances(np.asarray(thing.mesh.triangles, float), grid, MARGIN_MM)
-    return Solid(thing.name, tissue, distance, grid.first, steps, thing.mesh)
+    return Solid(thing.name, tissue, distance, grid.first, steps, thing.mesh, mirrors=thing.mirrors)
 
 
 def _grid(thing: Thing, steps: Array) -> Grid:
@@ -250,7 +261,38 @@ def between(low, high, share):
 
 @njit(inline="always")
 def distance_at(solids, solid, x, y, z):
-    """Signed distance of one solid at a point of the world: of a box exact, else trilinear, and 1e3 outside its grid."""
+    """Signed distance of one solid at a point of the world: of a box exact, else trilinear, and 1e3 outside its grid.
+
+    Of a displaced body it is one that no border is nearer than, as lengths shrink by its least stretch at most.
+    """
+    x, y, z = resting_place(solids, x, y, z)
+    return shrinking(solids) * resting_distance(solids, solid, x, y, z)
+
+
+@njit(inline="always")
+def is_displaced(solids):
+    """Whether a body has moved from its rest."""
+    return solids.field.moved.shape[0] > 0
+
+
+@njit(inline="always")
+def shrinking(solids):
+    """Least share of a resting distance that is left of it."""
+    return solids.field.stretch
+
+
+@njit(inline="always")
+def resting_place(solids, x, y, z):
+    """Where a point of a body rested."""
+    if is_displaced(solids):
+        field = solids.field
+        x, y, z = carried_back(field.moved, field.back, field.first, field.per_mm, x, y, z)
+    return x, y, z
+
+
+@njit(inline="always")
+def resting_distance(solids, solid, x, y, z):
+    """Signed distance of one solid, at rest, at a point."""
     first, end = solids.layers
     if first <= solid < end:
         grown = solids.grown
@@ -300,6 +342,13 @@ def _box_distance(frame, solid, x, y, z):
 @njit(inline="always")
 def label_at(solids, x, y, z):
     """Label of a point: 0 in the surroundings, k + 1 in solid k, the last that holds it."""
+    x, y, z = resting_place(solids, x, y, z)
+    return resting_label(solids, x, y, z)
+
+
+@njit(inline="always")
+def resting_label(solids, x, y, z):
+    """Label of a point of a body at rest."""
     (first, end), grown = solids.layers, solids.grown
     for k in range(len(solids.grid) - 1, -1, -1):
         if first <= k < end:

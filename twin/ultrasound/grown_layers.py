@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.compiled import kernel, njit
+from recon.compiled import kernel
 from scenes.scene_types import Layer, Layers
+from twin.trilinear import cell_at, within
 
 Array = NDArray[np.float64]
 
@@ -65,52 +66,19 @@ def _of_corners(values: NDArray[np.float32], bound: np.ufunc) -> NDArray[np.floa
     return values
 
 
-class _Cell(NamedTuple):
-    """A cell by its first point, i < 0 outside, and the shares of the way to its last one."""
-
-    i: int
-    j: int
-    k: int
-    a: float
-    b: float
-    c: float
-
-
-@njit(inline="always")
-def _cell(first, per_mm, shape, x, y, z):
-    """The cell of a grid that holds a point of the world."""
-    gx, gy, gz = (x - first[0]) * per_mm, (y - first[1]) * per_mm, (z - first[2]) * per_mm
-    if gx < 0 or gy < 0 or gz < 0 or gx > shape[0] - 1 or gy > shape[1] - 1 or gz > shape[2] - 1:
-        return _Cell(-1, -1, -1, 0.0, 0.0, 0.0)
-    i, j, k = min(int(gx), shape[0] - 2), min(int(gy), shape[1] - 2), min(int(gz), shape[2] - 2)
-    return _Cell(i, j, k, gx - i, gy - j, gz - k)
-
-
-@njit(inline="always")
-def _within(v, cell, n):
-    """The trilinear value of column n of a grid : (nx, ny, nz, m) in a cell."""
-    i, j, k, a, b, c = np.uint64(cell.i), np.uint64(cell.j), np.uint64(cell.k), cell.a, cell.b, cell.c
-    one, n = np.uint64(1), np.uint64(n)
-    near = (v[i, j, k, n] * (1 - c) + v[i, j, k + one, n] * c) * (1 - b)
-    near += (v[i, j + one, k, n] * (1 - c) + v[i, j + one, k + one, n] * c) * b
-    far = (v[i + one, j, k, n] * (1 - c) + v[i + one, j, k + one, n] * c) * (1 - b)
-    far += (v[i + one, j + one, k, n] * (1 - c) + v[i + one, j + one, k + one, n] * c) * b
-    return near * (1 - a) + far * a
-
-
 @kernel
 def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
     """The last layer that holds a point of the world, or NONE."""
-    cell = _cell(first, per_mm, distance.shape, x, y, z)
+    cell = cell_at(first, per_mm, distance.shape, x, y, z)
     if cell.i < 0:
         return NONE
     whole = sure[cell.i, cell.j, cell.k]
     if whole != MIXED:
         return whole
-    if _within(distance, cell, 0) > 0:
+    if within(distance, cell, 0) > 0:
         return NONE
     for layer in range(len(half_mm) - 1, -1, -1):
-        d, half = _within(distance, cell, layer), half_mm[layer]
+        d, half = within(distance, cell, layer), half_mm[layer]
         if (abs(d) if half > 0 else d) <= half:
             return layer
     return NONE
@@ -142,8 +110,8 @@ def layer_normal(distance, half_mm, first, per_mm, layer, x, y, z, step_mm):
 @kernel
 def _side(distance, first, per_mm, layer, x, y, z):
     """Distance to a layer, of a sheet to its middle, with its sides' signs."""
-    cell = _cell(first, per_mm, distance.shape, x, y, z)
-    return FAR_MM if cell.i < 0 else _within(distance, cell, layer)
+    cell = cell_at(first, per_mm, distance.shape, x, y, z)
+    return FAR_MM if cell.i < 0 else within(distance, cell, layer)
 
 
 @kernel

@@ -13,9 +13,17 @@ from scipy.ndimage import maximum_filter1d
 
 from recon.compiled import kernel, njit
 from recon.geometry import rigid
+from twin.displacement import Displacement, carried_along
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
-from twin.ultrasound.echo_solids import Body, Tissues, between, distance_at, label_at
+from twin.ultrasound.echo_solids import (
+    Body,
+    Tissues,
+    between,
+    is_displaced,
+    resting_distance,
+    resting_label,
+)
 from twin.ultrasound.grown_layers import layer_normal, uneven_at
 from twin.ultrasound.scan_lines import on_lines, widening
 from twin.ultrasound.sound_paths import GRADIENT_MM, Paths
@@ -30,6 +38,7 @@ RUN = 8  # cells in a row whose tissue is looked up at once, where no border is 
 CLEAR = 1.15  # over a run's reach: distances of bent surfaces are true to second order
 X, Y, Z = range(3)  # rows of `Lattice.face_from_world`, and of a column's places in the face's frame
 LABEL, ALONG, DEPTH, P, Q, R = range(3, 9)  # the others: tissue, place on the lines, and place in the cell in steps of 2^-BITS
+RESTED = 9  # and the two after it: where it rests in the world, of a displaced body
 SPECK_MM = 0.05  # scattering length of a calcification of 0.2 mm: of a rigid sphere longer than a wave, half its radius
 WIDTH = 0.26  # sine of the angle off the normal, over which fibres lose their brightness; assumed
 NEAR_BORDER = -1  # a label that has to be looked up at each place
@@ -55,7 +64,7 @@ class _Columns(NamedTuple):
 
     first: int  # of them, along the lattice's first axis
     end: int
-    places: Array  # (9, m) of its scatterers in the slice
+    places: Array  # (12, m) of its scatterers in the slice
     cell: NDArray[np.int64]  # (3,) its place on the lattice
 
 
@@ -64,11 +73,12 @@ def scatter(body: Body, transducer: Transducer, beam: Beam, paths: Paths, world_
     scanner = scanner_at(transducer, beam, paths, world_from_image, seed)
     lattice = _lattice(body, transducer, beam, scanner.world_from_face)
     first, solids = lattice.axes[0], body.packed()
-    most = 2 * RUN + int(4 * (lattice.half_mm.max() / lattice.edge_mm + 2))  # cells of a column; its cosine is 0.57 at least
+    reach = lattice.half_mm.max() / solids.field.stretch / lattice.edge_mm
+    most = 2 * RUN + int(4 * (reach + 2))  # cells of a column; its cosine is 0.57 at least
 
     def lay(field: Field, part: int) -> tuple[int, int]:
         begin, end = slab(part, int(lattice.high[first] - lattice.low[first] + 1))
-        columns = _Columns(lattice.low[first] + begin, lattice.low[first] + end, np.empty((9, most)), np.zeros(3, np.int64))
+        columns = _Columns(lattice.low[first] + begin, lattice.low[first] + end, np.empty((12, most)), np.zeros(3, np.int64))
         return _scatter(field, columns, solids, lattice, scanner, beam, paths)
 
     return laid(lay, field_like(transducer, beam))
@@ -79,7 +89,7 @@ def _lattice(body: Body, transducer: Transducer, beam: Beam, pose: Array) -> _La
     strength = np.sqrt(body.scattering() / transducer.scatterers_per_mm3) * transducer.wavelength_mm
     turns = np.exp(2j * np.pi * np.arange(TURNS) / TURNS).astype(np.complex64)
     axes = _axes(pose)
-    low, high = _box(transducer, beam, pose, edge)
+    low, high = _box(transducer, beam, pose, edge, body.field)
     face_from_world = np.ascontiguousarray(rigid.invert(pose)[:3])
     half = _half_thickness(beam, pose, axes[2], edge, transducer.face is not None)
     speck = np.float32(SPECK_MM * transducer.wavelength_mm)
@@ -93,7 +103,9 @@ def _axes(pose: Array) -> NDArray[np.int64]:
     return np.array([along, other, across])
 
 
-def _box(transducer: Transducer, beam: Beam, pose: Array, edge: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _box(
+    transducer: Transducer, beam: Beam, pose: Array, edge: float, field: Displacement
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """First and last cell of the box around the slice."""
     deepest = beam.depth_step_mm * (len(beam.core_mm) - 1)
     x, y = np.array([-BESIDE_MM, transducer.width_mm + BESIDE_MM]), np.array([0.0, deepest])
@@ -102,7 +114,8 @@ def _box(transducer: Transducer, beam: Beam, pose: Array, edge: float) -> tuple[
         x, y = np.array([-aside, aside]), np.array([-face.sagitta_mm - BESIDE_MM, deepest])
     z = np.array([-1.0, 1.0]) * float(beam.core_mm.max())
     corners = np.stack(np.meshgrid(x, y, z), axis=-1).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-    low, high = corners.min(axis=0) / edge, corners.max(axis=0) / edge
+    farthest = np.abs(field.moved).max(axis=(0, 1, 2), initial=0)
+    low, high = (corners.min(axis=0) - farthest) / edge, (corners.max(axis=0) + farthest) / edge
     return np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
 
 
@@ -146,13 +159,16 @@ def _scatter(field, columns, solids, lattice, scanner, beam, paths):
 def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
     """Find a column's scatterers in the slice: fills the rows of `places`; their number."""
     right = scanner.line_mm * (len(paths.labels) - 1) + BESIDE_MM
-    low, high = _cells_in_slice(cell, lattice, beam, scanner, right)
+    low, high = _cells_in_slice(cell, solids, lattice, beam, scanner, right)
+    displaced = is_displaced(solids)
     found, per_step = 0, 1 / beam.depth_step_mm
     for start in range(low, high + 1, RUN):
         label = _label_of_run(cell, start, solids, lattice)
         if label >= 0 and lattice.strength[label] == 0:
             continue
         _hash_places(places, found, cell, start, lattice, scanner.seed)
+        if displaced:
+            _carry(places, found, found + RUN, solids.field, lattice.face_from_world, scanner.world_from_face)
         for n in range(found, found + min(RUN, high + 1 - start)):
             x, y, z = places[X, n], places[Y, n], places[Z, n]
             along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
@@ -161,12 +177,43 @@ def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
                 places[X, found], places[Y, found], places[Z, found], places[LABEL, found] = x, y, z, label
                 places[ALONG, found], places[DEPTH, found] = along, depth
                 places[P, found], places[Q, found], places[R, found] = places[P, n], places[Q, n], places[R, n]
+                if displaced:
+                    for row in range(RESTED, RESTED + 3):
+                        places[row, found] = places[row, n]
                 found += 1
     return found
 
 
+@kernel
+def _carry(places, first, end, field, face_from_world, world_from_face):
+    """Carry scatterers from where they rest to where they are, in the face's frame."""
+    to = face_from_world
+    for n in range(first, end):
+        rx, ry, rz = _in_world(world_from_face, places[X, n], places[Y, n], places[Z, n])
+        places[RESTED, n], places[RESTED + 1, n], places[RESTED + 2, n] = rx, ry, rz
+        x, y, z = carried_along(field.moved, field.first, field.per_mm, rx, ry, rz)
+        for axis in range(3):
+            places[axis, n] = to[axis, X] * x + to[axis, Y] * y + to[axis, Z] * z + to[axis, 3]
+
+
+@kernel
+def _crossing(field, to, axes, u, v, w):
+    """Where a column of a displaced body crosses the image's plane, along it, and the crossing in the face's frame."""
+    first, second, main = axes[0], axes[1], axes[2]
+    px = py = 0.0
+    for _ in range(4):
+        rx = u if first == X else v if second == X else w
+        ry = u if first == Y else v if second == Y else w
+        rz = u if first == Z else v if second == Z else w
+        x, y, z = carried_along(field.moved, field.first, field.per_mm, rx, ry, rz)
+        px = to[X, X] * x + to[X, Y] * y + to[X, Z] * z + to[X, 3]
+        py = to[Y, X] * x + to[Y, Y] * y + to[Y, Z] * z + to[Y, 3]
+        w -= (to[Z, X] * x + to[Z, Y] * y + to[Z, Z] * z + to[Z, 3]) / to[Z, main]
+    return w, px, py
+
+
 @njit(inline="always")
-def _cells_in_slice(cell, lattice, beam, scanner, right):
+def _cells_in_slice(cell, solids, lattice, beam, scanner, right):
     """First and last cell of a column that may hold scatterers in the slice; the last before the first if none may."""
     first, second, main = lattice.axes[0], lattice.axes[1], lattice.axes[2]
     to, edge = lattice.face_from_world, lattice.edge_mm
@@ -174,6 +221,9 @@ def _cells_in_slice(cell, lattice, beam, scanner, right):
     w = -(u * to[Z, first] + v * to[Z, second] + to[Z, 3]) / normal  # where the column crosses the image's plane
     x = u * to[X, first] + v * to[X, second] + w * to[X, main] + to[X, 3]
     y = u * to[Y, first] + v * to[Y, second] + w * to[Y, main] + to[Y, 3]
+    if is_displaced(solids):
+        w, x, y = _crossing(solids.field, to, lattice.axes, u, v, w)
+        normal *= solids.field.stretch
     along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
     half = lattice.half_mm[min(max(int(depth / beam.depth_step_mm + 0.5), 0), len(lattice.half_mm) - 1)]
     most = (half + 2 * edge) / abs(normal)
@@ -200,7 +250,7 @@ def _label_of_run(cell, start, solids, lattice):
         return NEAR_BORDER  # borders are everywhere
     label = 0
     for solid in range(len(solids.grid)):
-        d = distance_at(solids, solid, x, y, z)
+        d = resting_distance(solids, solid, x, y, z)
         if abs(d) <= radius:
             return NEAR_BORDER
         if d < 0:
@@ -239,8 +289,8 @@ def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
     for n in range(found):
         along, y, z, label = places[ALONG, n], places[DEPTH, n], places[Z, n], int(places[LABEL, n])
         if label == NEAR_BORDER:
-            wx, wy, wz = _in_world(scanner.world_from_face, places[X, n], places[Y, n], z)
-            label = label_at(solids, wx, wy, wz)
+            wx, wy, wz = _resting_place(solids, places, n, scanner.world_from_face)
+            label = resting_label(solids, wx, wy, wz)
         strength = lattice.strength[label]
         if solids.layers[0] < solids.layers[1]:
             strength = _uneven_strength(solids, lattice, label, places, n, scanner)
@@ -275,6 +325,14 @@ def _in_world(pose, x, y, z):
 
 
 @njit(inline="always")
+def _resting_place(solids, places, n, pose):
+    """Where a scatterer rests in the world."""
+    if is_displaced(solids):
+        return places[RESTED, n], places[RESTED + 1, n], places[RESTED + 2, n]
+    return _in_world(pose, places[X, n], places[Y, n], places[Z, n])
+
+
+@njit(inline="always")
 def _uneven_strength(solids, lattice, label, places, n, scanner):
     """Strength of a scatterer of uneven tissue, of fibres that lie along a layer's faces, or of a calcification."""
     if lattice.tissues.specks[label] > 0 and _is_speck(places, n, lattice, label, scanner.seed):
@@ -283,7 +341,7 @@ def _uneven_strength(solids, lattice, label, places, n, scanner):
     if value == 0:
         return value
     pose, fibres = scanner.world_from_face, lattice.tissues.fibres[label]
-    wx, wy, wz = _in_world(pose, places[X, n], places[Y, n], places[Z, n])
+    wx, wy, wz = _resting_place(solids, places, n, pose)
     grown = solids.grown
     value *= uneven_at(grown.uneven, grown.first, grown.per_mm, wx, wy, wz)
     if fibres > 0 and solids.layers[0] < label <= solids.layers[1]:
@@ -296,5 +354,24 @@ def _fibres(solids, solid, pose, x, y, z, fibres):
     """Amplitude of fibres along a layer's faces, brightest where sound meets them squarely: a Gaussian of WIDTH."""
     layer, grown = solid - solids.layers[0], solids.grown
     nx, ny, nz = layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, GRADIENT_MM)
+    if is_displaced(solids):
+        nx, ny, nz = _turned(solids.field, nx, ny, nz, x, y, z)
     cosine = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
     return np.float32(np.exp(fibres * np.exp((cosine * cosine - 1) / (2 * WIDTH**2))))
+
+
+@kernel
+def _turned(field, nx, ny, nz, x, y, z):
+    """A normal at a place of a body at rest, as the displacement has turned it: `n - grad(u) n`, to first order."""
+    h, moved, first, per_mm = 1.0, field.moved, field.first, field.per_mm
+    ax, ay, az = carried_along(moved, first, per_mm, x + h, y, z)
+    bx, by, bz = carried_along(moved, first, per_mm, x - h, y, z)
+    tx = nx - (nx * (ax - bx - 2 * h) + ny * (ay - by) + nz * (az - bz)) / (2 * h)
+    ax, ay, az = carried_along(moved, first, per_mm, x, y + h, z)
+    bx, by, bz = carried_along(moved, first, per_mm, x, y - h, z)
+    ty = ny - (nx * (ax - bx) + ny * (ay - by - 2 * h) + nz * (az - bz)) / (2 * h)
+    ax, ay, az = carried_along(moved, first, per_mm, x, y, z + h)
+    bx, by, bz = carried_along(moved, first, per_mm, x, y, z - h)
+    tz = nz - (nx * (ax - bx) + ny * (ay - by) + nz * (az - bz - 2 * h)) / (2 * h)
+    size = np.sqrt(tx * tx + ty * ty + tz * tz)
+    return tx / size, ty / size, tz / size

@@ -13,7 +13,18 @@ from numpy.typing import NDArray
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
 from twin.ultrasound.beam import DEEPER
-from twin.ultrasound.echo_solids import Body, between, distance_at, is_sheet, label_at, own_distance
+from twin.ultrasound.echo_solids import (
+    Body,
+    between,
+    distance_at,
+    is_displaced,
+    is_sheet,
+    label_at,
+    own_distance,
+    resting_distance,
+    resting_place,
+    shrinking,
+)
 from twin.ultrasound.grown_layers import layer_normal
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
 from twin.ultrasound.transducer import Transducer
@@ -22,7 +33,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 LEAP_MM = 2.5  # at most, without a look at the tissue; less than the margin of the solids' grids
-RAGGED = 0.5  # cosine; assumed
+RAGGED = 0.5  # cosine, by which a ragged border turns a line at most; assumed
 GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
 
@@ -74,6 +85,8 @@ def reflection(z1, z2, c1, c2, cosine):
 def normal_at(solids, solid, x, y, z):
     """Outward normal of a solid at a point of the world, from central differences."""
     h, grown = GRADIENT_MM, solids.grown
+    if is_displaced(solids):
+        return _displaced_normal(solids, solid, x, y, z)
     if solids.layers[0] <= solid < solids.layers[1]:
         layer = solid - solids.layers[0]
         return layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, h)
@@ -82,6 +95,19 @@ def normal_at(solids, solid, x, y, z):
     c = own_distance(solids, solid, x, y, z + h) - own_distance(solids, solid, x, y, z - h)
     size = np.sqrt(a * a + b * b + c * c) + 1e-12
     return a / size, b / size, c / size
+
+
+@kernel
+def _displaced_normal(solids, solid, x, y, z):
+    """Outward normal of a solid of a displaced body, from differences of distances at rest: the gradient is the world's."""
+    nx = ny = nz = 0.0
+    for side in range(6):
+        step = GRADIENT_MM if side % 2 else -GRADIENT_MM
+        axis = side // 2
+        d = distance_at(solids, solid, x + step * (axis == 0), y + step * (axis == 1), z + step * (axis == 2)) / step
+        nx, ny, nz = nx + d * (axis == 0), ny + d * (axis == 1), nz + d * (axis == 2)
+    size = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
+    return nx / size, ny / size, nz / size
 
 
 @njit(inline="always")
@@ -95,8 +121,9 @@ def table_at(table, line, depth, step_mm):
 def _nearest(solids, x, y, z):
     """Distance to the nearest border, LEAP_MM at most."""
     near = LEAP_MM
+    x, y, z = resting_place(solids, x, y, z)
     for solid in range(len(solids.grid)):
-        near = min(near, abs(distance_at(solids, solid, x, y, z)))
+        near = min(near, shrinking(solids) * abs(resting_distance(solids, solid, x, y, z)))
     return near
 
 
@@ -111,8 +138,8 @@ def _share_before(solids, solid, pose, point, step_mm):
 
 @njit(inline="always")
 def squareness(solids, solid, cosine):
-    """Cosine of the incidence on a border: of a ragged one, which has faces of all directions, no less than RAGGED."""
-    return max(abs(cosine), 0.02 if solids.mirrors[solid] else RAGGED)
+    """Cosine of the incidence on a border: 1 on a ragged one, as what its slanting faces take is the tissue's attenuation."""
+    return max(abs(cosine), 0.02) if solids.mirrors[solid] else 1.0
 
 
 @kernel
@@ -130,7 +157,7 @@ def _through_border(solids, tissues, pose, point, here, there):
     speed = tissues.speed[here], tissues.speed[there]
     r = reflection(tissues.impedance[here], tissues.impedance[there], speed[0], speed[1], square)
     along = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) * (1.0 if cosine > 0 else -1.0)
-    turn = (speed[1] / speed[0] - 1) * -along / square
+    turn = (speed[1] / speed[0] - 1) * -along / max(abs(cosine), 0.02 if solids.mirrors[solid] else RAGGED)
     return max(1 - r * r, 0.0), min(max(turn, -0.3), 0.3)
 
 

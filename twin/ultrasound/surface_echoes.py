@@ -15,7 +15,7 @@ from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
-from twin.ultrasound.echo_solids import Body, Wire, distance_at, label_at
+from twin.ultrasound.echo_solids import Body, Wire, distance_at, label_at, resting_distance, resting_place, shrinking
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
 from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
@@ -225,11 +225,12 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
 def _measure(ray, t, solids, sides, distances):
     """Measure the distances at a depth of a ray; returns a step that crosses no border."""
     near = STEPS_MM[1]
+    x, y, z = resting_place(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
     for solid in range(len(sides)):
         distances[BEFORE, solid] = distances[AFTER, solid]
         distances[AFTER, solid] = sides[solid]  # its sign counts, where the span has none of its borders
         if sides[solid] == NEAR:
-            d = distance_at(solids, solid, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+            d = shrinking(solids) * resting_distance(solids, solid, x, y, z)
             distances[AFTER, solid] = d
             near = min(near, SURE * abs(d))
     return near

@@ -1,6 +1,7 @@
 """The sweep part of a session: B-scans along a path through a scene, image by image, and the truth about them."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Annotated, Protocol
 
@@ -42,7 +43,10 @@ from twin.ultrasound.transducer import Transducer
 
 AnyPath = Annotated[SurfacePath | Hold | Bob | WirePath | RowPath | TiltPath, Field(discriminator="kind")]
 
+Array = NDArray[np.float64]
+
 POSES = "sweep.npz"  # in the sweep's own folder of truth
+LIVING = "living.npz"  # of a body that lives
 LABELS = "labels"
 SCANS = "scans"  # of further bodies at the moments of the images; at the cameras' in BODIES
 PURPOSES: dict[str, Purpose] = {
@@ -65,10 +69,16 @@ def plan_sweep(
     noise: PoseNoise,
     seed: int,
     errors: conditions.Motion = STILL,
+    carried: Callable[[NDArray[np.int64]], Array] | None = None,
+    gives_mm: float = 5.0,
 ) -> Plan:
     """Lead the probe along a path, and set the times of its images.
 
+    Parameters
+    ----------
     errors : of the hand, which trembles where it leads the probe, and of the bracket.
+    carried : motion : (n, 4, 4) of the hand, by which it goes along with the body, at moments : (n,) ns.
+    gives_mm : by which a surface gives way to the probe, at most
 
     Raises
     ------
@@ -77,7 +87,6 @@ def plan_sweep(
     """
     shaken = conditions.trembling(errors, seed)
     path_seed, clock_seed = np.random.SeedSequence(seed).generate_state(2).tolist()
-    gives_mm = 5.0  # by which a surface gives way to the probe, at most
     match path:
         case SurfacePath():
             course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
@@ -103,6 +112,8 @@ def plan_sweep(
             course, rests = over_surface(path, body, transducer, path_seed)
             taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
             _refuse_inside(course, body, transducer)
+    if carried is not None:
+        course = replace(course, poses=carried(course.times) @ course.poses)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
 
 
@@ -212,6 +223,7 @@ def write_session(
     probe: ProbeCalibration | None,
     film: FilmPart | None = None,
     bodies: Mapping[str, TrackedBody] = MappingProxyType({}),
+    living: Callable[[], Mapping[str, Array]] | None = None,
 ) -> None:
     """Write a sweep and its truth, taking the scans one by one, and then the frames.
 
@@ -220,10 +232,14 @@ def write_session(
     probe : of the capture; None where it is still to be calibrated.
     film : of the cameras, in which the poses are then still to be found; None where the poses are given.
     bodies : further ones, by name
+    living : truth of a body that lives, worked out when the images are written
     """
     with session.write(_describe_sound(scene, body)) as (capture, truth):
         own = truth.own.relative_to(truth.folder)
         truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
+
+        if living is not None:
+            truth.write_arrays(str(own / LIVING), living())
 
         shown: dict[str, list[dict[str, NDArray]]] = {one: [] for one in bodies}
 

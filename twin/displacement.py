@@ -1,0 +1,174 @@
+"""Displacement of a body's points: a field on a grid, its inverse, and both for compiled code.
+
+A point that rests at X lies at `x = X + u(X)`, with u trilinear between the points of a grid and constant beyond it: this defines
+where everything is. Where x rested follows from a table of the inverse and steps `X <- x - u(X)`, which halve the error at least
+where no strain exceeds one half.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.compiled import kernel, njit
+from recon.threads import in_threads
+from twin.trilinear import nearest_cell
+
+Array = NDArray[np.float64]
+Field = NDArray[np.float32]
+
+STEPS = 2  # from the table of the inverse on: the error falls below 0.01 mm in a dent of 3 mm within 8 mm
+LEAST_STRETCH = 0.3  # that counts; where a field shrinks lengths by more, borders may be missed
+STEPS_OF_TABLE = 40  # at the table's own points
+
+
+class Displacement(NamedTuple):
+    """A field of displacements and the table of its inverse, for compiled code; with empty grids nothing moves."""
+
+    first: Array  # (3,) mm in the world, the first grid point
+    per_mm: float  # grid points
+    moved: Field  # (nx, ny, nz, 3) mm, from where a point rests to where it is
+    back: Field  # (nx, ny, nz, 3) mm, from where a point is to where it rested
+    stretch: float  # least length of what rested 1 mm long
+
+
+NOWHERE = Displacement(np.zeros(3), 1.0, np.zeros((0, 0, 0, 3), np.float32), np.zeros((0, 0, 0, 3), np.float32), 1.0)
+"""of a body that keeps its form"""
+
+
+def displacement(first: Array, step_mm: float, moved: Field) -> Displacement:
+    """Set up a field : (nx, ny, nz, 3) mm on a grid in the world, and the table of its inverse."""
+    moved = np.ascontiguousarray(moved, np.float32)
+    slopes = sum(np.square(_slope(moved, axis)).sum(axis=-1) for axis in range(3)) / step_mm**2
+    stretch = max(1 - float(np.sqrt(np.max(slopes))), LEAST_STRETCH)
+    field = Displacement(np.asarray(first, float), 1 / step_mm, moved, np.zeros_like(moved), stretch)
+    in_threads(_tabulate, len(moved), field)
+    return field
+
+
+def led_through(field: Displacement) -> Displacement:
+    """The displacement of points that drift through a field of small displacements, as through a steady flow.
+
+    The flow of a field without divergence keeps volumes, where the field itself keeps them to first order alone.
+    Midpoint rule, in steps of a quarter.
+    """
+    steps = 4
+    whole, half = (field._replace(moved=field.moved / np.float32(n * steps)) for n in (1, 2))
+    rested = np.stack(np.meshgrid(*_axes(field), indexing="ij"), axis=-1)
+    place = rested
+    for _ in range(steps):
+        middle = moved_to(half, place)
+        place = place + (moved_to(whole, middle) - middle)
+    return displacement(field.first, 1 / field.per_mm, (place - rested).astype(np.float32))
+
+
+def _axes(field: Displacement) -> list[Array]:
+    return [start + np.arange(count) / field.per_mm for start, count in zip(field.first, field.moved.shape[:3], strict=True)]
+
+
+def moved_to(field: Displacement, points: Array) -> Array:
+    """Where points : (n, 3) mm lie that rested at these."""
+    return _carried(field, points, 0)
+
+
+def rested_at(field: Displacement, points: Array) -> Array:
+    """Where points : (n, 3) mm rested that lie at these."""
+    return _carried(field, points, STEPS_OF_TABLE)
+
+
+def volume_ratio(field: Displacement) -> Array:
+    """Volume of each cell of the grid over that at rest : (nx - 1, ny - 1, nz - 1), from the gradient in its middle."""
+    u = field.moved.astype(float)
+    slopes = np.stack([_slope(u, axis) * field.per_mm for axis in range(3)], axis=-1)
+    return np.linalg.det(np.eye(3) + slopes)
+
+
+def _slope(u: Array, axis: int) -> Array:
+    """Difference along an axis, averaged over the others, in the cells' middles : (nx - 1, ny - 1, nz - 1, 3)."""
+    values = np.diff(u, axis=axis)
+    for other in {0, 1, 2} - {axis}:
+        low, high = (np.take(values, range(n, values.shape[other] - 1 + n), axis=other) for n in (0, 1))
+        values = (low + high) / 2
+    return values
+
+
+def _carried(field: Displacement, points: Array, steps: int) -> Array:
+    flat = np.ascontiguousarray(np.asarray(points, float).reshape(-1, 3))
+    if not field.moved.size:
+        return flat.reshape(np.shape(points)).copy()
+    found = np.empty_like(flat)
+    in_threads(_carry, len(flat), found, flat, field, steps)
+    return found.reshape(np.shape(points))
+
+
+@njit(inline="always")
+def _vector(v, first, per_mm, x, y, z):
+    """The vector of a field at a place."""
+    cell = nearest_cell(first, per_mm, v.shape, x, y, z)
+    i, j, k, one = np.uint64(cell.i), np.uint64(cell.j), np.uint64(cell.k), np.uint64(1)
+    p, q, r = (1 - cell.a) * (1 - cell.b), (1 - cell.a) * cell.b, cell.a * (1 - cell.b)
+    s = cell.a * cell.b
+    low, high = 1 - cell.c, cell.c
+    first, second, third, fourth = v[i, j], v[i, j + one], v[i + one, j], v[i + one, j + one]
+    u = p * (low * first[k, 0] + high * first[k + one, 0]) + q * (low * second[k, 0] + high * second[k + one, 0])
+    u += r * (low * third[k, 0] + high * third[k + one, 0]) + s * (low * fourth[k, 0] + high * fourth[k + one, 0])
+    w = p * (low * first[k, 1] + high * first[k + one, 1]) + q * (low * second[k, 1] + high * second[k + one, 1])
+    w += r * (low * third[k, 1] + high * third[k + one, 1]) + s * (low * fourth[k, 1] + high * fourth[k + one, 1])
+    t = p * (low * first[k, 2] + high * first[k + one, 2]) + q * (low * second[k, 2] + high * second[k + one, 2])
+    t += r * (low * third[k, 2] + high * third[k + one, 2]) + s * (low * fourth[k, 2] + high * fourth[k + one, 2])
+    return u, w, t
+
+
+@kernel
+def carried_along(moved, first, per_mm, x, y, z):
+    """Where a point lies that rests at a place."""
+    u, v, w = _vector(moved, first, per_mm, x, y, z)
+    return x + u, y + v, z + w
+
+
+@kernel
+def carried_back(moved, back, first, per_mm, x, y, z):
+    """Where a point rested that lies at a place."""
+    u, v, w = _vector(back, first, per_mm, x, y, z)
+    rx, ry, rz = x + u, y + v, z + w
+    for _ in range(STEPS):
+        u, v, w = _vector(moved, first, per_mm, rx, ry, rz)
+        rx, ry, rz = x - u, y - v, z - w
+    return rx, ry, rz
+
+
+@kernel
+def _tabulate(first, end, field):
+    """Fill planes of the inverse's table."""
+    back, step = field.back, 1 / field.per_mm
+    for i in range(first, end):
+        x = field.first[0] + step * i
+        for j in range(back.shape[1]):
+            y = field.first[1] + step * j
+            for k in range(back.shape[2]):
+                z = field.first[2] + step * k
+                rx, ry, rz = x, y, z
+                for _ in range(STEPS_OF_TABLE):
+                    u, v, w = _vector(field.moved, field.first, field.per_mm, rx, ry, rz)
+                    off = abs(x - u - rx) + abs(y - v - ry) + abs(z - w - rz)
+                    rx, ry, rz = x - u, y - v, z - w
+                    if off < 1e-6:
+                        break
+                back[i, j, k, 0], back[i, j, k, 1], back[i, j, k, 2] = rx - x, ry - y, rz - z
+
+
+@kernel
+def _carry(first, end, found, points, field, steps):
+    """Carry points along, or back in so many steps from the table on."""
+    for n in range(first, end):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if steps == 0:
+            u, v, w = _vector(field.moved, field.first, field.per_mm, x, y, z)
+            found[n, 0], found[n, 1], found[n, 2] = x + u, y + v, z + w
+        else:
+            u, v, w = _vector(field.back, field.first, field.per_mm, x, y, z)
+            rx, ry, rz = x + u, y + v, z + w
+            for _ in range(steps):
+                u, v, w = _vector(field.moved, field.first, field.per_mm, rx, ry, rz)
+                rx, ry, rz = x - u, y - v, z - w
+            found[n, 0], found[n, 1], found[n, 2] = rx, ry, rz

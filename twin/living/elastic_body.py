@@ -1,0 +1,380 @@
+"""A soft body on a hard base under a probe's face: linear elasticity by finite elements, with contact that only pushes.
+
+The body is meshed in columns along the world's z, from the skin that faces the cameras down to what holds it. Elements are
+trilinear hexahedra of nearly incompressible, isotropic tissue; the change of volume counts in their middles alone, so that they
+don't lock (selective reduced integration). The face is a set of points; a point that lies below the skin pushes it along the
+face's normal until it lies in the face, and none pulls:
+
+    f >= 0,  C f - d >= 0,  f (C f - d) = 0,
+
+with the compliance C of the skin at the points and their depths d below the resting skin: Signorini's conditions, solved as a
+non-negative least-squares problem.
+Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wriggers 2006, Computational Contact Mechanics, 5.
+"""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+import skfem
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
+from skfem.helpers import ddot, div, eye, sym_grad, trace
+from threadpoolctl import threadpool_limits
+
+from recon.compiled import kernel
+from recon.threads import in_threads
+from twin.displacement import Displacement, displacement, led_through, moved_to
+from twin.ultrasound.echo_solids import Body, Solid, label_at
+from twin.ultrasound.probe_path import top
+
+Array = NDArray[np.float64]
+
+ELEMENT_MM = 3.0  # along x and y: displacements under a probe are then within 2 % of those of 2.5 mm
+TILE = 4  # nodes of the skin along x and y whose responses are worked out at once
+LAYERS = (0.04, 0.06, 0.08, 0.11, 0.15, 0.18, 0.19, 0.19)  # heights of a column's elements over its own, from the skin
+BESIDE_MM = 15.0  # of the mesh beside a body that lies on a soft support
+HELD_MM = 10.0  # below a soft support's surface, where bone holds it; assumed
+LEAST_MM = 3.0  # of a column; lower ones are left out
+POISSON = 0.495  # of soft tissue: nearly incompressible
+STIFFEST = 40.0  # times the softest: stiffer tissues, which don't yield beside it, count as much
+GRID_MM = 2.5  # of the grid that displacements are kept on
+SAMPLES = (2, 2, 2)  # of an element's tissues
+
+
+class Mesh(NamedTuple):
+    """Columns of nodes."""
+
+    x: Array  # (nx,) mm in the world
+    y: Array  # (ny,)
+    skin: Array  # (nx, ny) mm, z of the skin
+    base: float  # mm, z of what holds the body
+    kept: NDArray[np.bool_]  # (nx - 1, ny - 1) whether a column of elements is tissue
+
+    @property
+    def shares(self) -> Array:
+        """Depth of the nodes of a column below the skin over its height : (nz,)."""
+        return np.concatenate([[0.0], np.cumsum(LAYERS)])
+
+    def nodes(self) -> Array:
+        """Places of all nodes : (nx, ny, nz, 3) mm in the world."""
+        z = self.skin[..., None] + (self.base - self.skin)[..., None] * self.shares
+        x, y = np.broadcast_to(self.x[:, None, None], z.shape), np.broadcast_to(self.y[None, :, None], z.shape)
+        return np.stack([x, y, z], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneFactor:
+    """Cholesky's factor of a stiffness that couples each plane of nodes with the next ones alone, plane by plane."""
+
+    ends: NDArray[np.int64]  # (p + 1,) first unknown of each of the p planes, and the end
+    own: list[Array]  # (p,) lower triangles L, of (m, m)
+    before: list[Array]  # (p,) C = A L'^-T of the coupling A with the plane before, whose triangle is L'; empty of the first
+
+    @classmethod
+    def of(cls, stiffness: sparse.csr_matrix, ends: NDArray[np.int64]) -> "PlaneFactor":
+        """Factorise, on one thread, for the same bits anywhere."""
+        own, before = list[Array](), list[Array]()
+        with threadpool_limits(1):
+            for k, (first, end) in enumerate(pairwise(ends.tolist())):
+                block, coupling = stiffness[first:end, first:end].toarray(), np.zeros((end - first, 0))
+                if k:
+                    coupling = stiffness[first:end, ends[k - 1] : first].toarray()
+                    coupling = solve_triangular(own[-1], coupling.T, lower=True, check_finite=False).T
+                    block -= coupling @ coupling.T
+                own.append(np.tril(cholesky(block, lower=True, overwrite_a=True, check_finite=False)))
+                before.append(np.ascontiguousarray(coupling))
+        return cls(ends, own, before)
+
+    def solve(self, forces: Array) -> Array:
+        """Displacements : (m, k) by forces : (m, k); bits depend on k."""
+        found = forces.astype(float)
+        parts = [slice(*ends) for ends in pairwise(self.ends.tolist())]
+        with threadpool_limits(1):
+            for k, part in enumerate(parts):
+                if k:
+                    found[part] -= self.before[k] @ found[parts[k - 1]]
+                found[part] = solve_triangular(self.own[k], found[part], lower=True, check_finite=False)
+            for k in reversed(range(len(parts))):
+                if k + 1 < len(parts):
+                    found[parts[k]] -= self.before[k + 1].T @ found[parts[k + 1]]
+                found[parts[k]] = solve_triangular(self.own[k], found[parts[k]], lower=True, trans="T", check_finite=False)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticBody:
+    """A body that yields, and its responses to unit forces on the skin, which are worked out as they are asked for."""
+
+    mesh: Mesh
+    free: NDArray[np.int64]  # (m,) numbers of the degrees of freedom that nothing holds
+    factor: PlaneFactor  # of the stiffness of these
+    coupling: sparse.csr_matrix  # (m, k) stiffness between these and those of the base
+    held: NDArray[np.int64]  # (k,) numbers of the base's degrees of freedom
+    responses: dict[int, NDArray[np.float32]] = field(default_factory=dict)  # (3 n, 3) by node of the skin, mm for each force
+    lock: Lock = field(default_factory=Lock)  # of the responses
+
+    @property
+    def size(self) -> tuple[int, int, int]:
+        """Nodes along x, y and depth."""
+        return len(self.mesh.x), len(self.mesh.y), len(LAYERS) + 1
+
+    def respond(self, nodes: NDArray[np.int64]) -> None:
+        """Work out what unit forces on nodes of the skin, by i ny + j, do: with all of their tile, for the same bits always."""
+        nx, ny, nz = self.size
+        place = np.full(3 * nx * ny * nz, -1)
+        place[self.free] = np.arange(len(self.free))
+        with self.lock:
+            wanted = {(node // ny // TILE, node % ny // TILE) for node in nodes.tolist() if node not in self.responses}
+            for a, b in sorted(wanted):
+                i, j = (TILE * first + np.arange(TILE) for first in (a, b))
+                tile = (i[i < nx, None] * ny + j[j < ny]).ravel()
+                rows = place[3 * nz * np.repeat(tile, 3) + np.tile(np.arange(3), len(tile))]
+                forces = np.zeros((len(self.free), len(rows)))
+                forces[rows[rows >= 0], np.flatnonzero(rows >= 0)] = 1.0
+                every = np.zeros((len(place), len(rows)), np.float32)
+                every[self.free] = self.factor.solve(forces)
+                self.responses.update({node: every[:, 3 * n : 3 * n + 3].copy() for n, node in enumerate(tile.tolist())})
+
+    def moved_base(self, shifts: Array) -> Array:
+        """Displacements : (nx, ny, nz, 3) mm of all nodes when those of the base are moved : (nx, ny, 3) mm."""
+        every = np.zeros((*self.size, 3))
+        every[:, :, -1] = shifts
+        flat = every.reshape(-1)
+        flat[self.free] = self.factor.solve(-(self.coupling @ flat[self.held])[:, None])[:, 0]
+        return every
+
+
+def elastic_body(body: Body, surface: Solid, support: Solid | None, element_mm: float = ELEMENT_MM) -> ElasticBody:
+    """Mesh a solid that faces the cameras, with all that lies in it, and factorise its stiffness; takes some seconds.
+
+    support : on which it lies; where that is soft, the body is held HELD_MM below its surface
+    """
+    mesh = _mesh(surface, support, element_mm)
+    modulus = _moduli(body, mesh)
+    stiffness = _stiffness(mesh, modulus)
+    number = np.arange(stiffness.shape[0]).reshape(*mesh.skin.shape, -1)
+    held = number[:, :, -3:].ravel()
+    used = np.zeros(mesh.skin.shape, bool)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        used[i : i + mesh.kept.shape[0], j : j + mesh.kept.shape[1]] |= mesh.kept
+    free = number[..., :-3][used].ravel()
+    plane = free // int(np.prod(number.shape[1:]))
+    ends = np.searchsorted(free, number[np.unique(plane), 0, 0])
+    factor = PlaneFactor.of(stiffness[free][:, free].tocsr(), np.append(ends, len(free)))
+    return ElasticBody(mesh, free, factor, stiffness[free][:, held].tocsr(), held)
+
+
+def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None = None, drag: Array | None = None) -> Displacement:
+    """Displacement of a body under a probe's face.
+
+    Parameters
+    ----------
+    face : (m, 3) mm
+        Points of the face, in the world.
+    normal : (3,)
+        Unit, into the tissue.
+    already : (nx, ny, nz, 3) mm
+        Displacements of the nodes by other causes, which the face meets.
+    drag : (3,) mm
+        By which the face draws the skin along that it touches, square to the normal.
+    """
+    base = np.zeros((*soft.size, 3)) if already is None else already
+    under = _under(soft, face, normal)
+    nodes, at = np.unique(under.nodes, return_inverse=True)
+    soft.respond(nodes)
+    share = np.zeros((len(face), len(nodes)))
+    np.add.at(share, (np.repeat(np.arange(len(face)), 4), at.ravel()), under.weights.ravel())
+    surface = 3 * soft.size[2] * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))
+    compliance = np.stack([soft.responses[node][surface] for node in nodes.tolist()], axis=1)  # (3 k, k, 3)
+    compliance = compliance.astype(float).reshape(len(nodes), 3, len(nodes), 3)
+    skin = np.einsum("ma,aibj,nb->minj", share, compliance, share, optimize=True)  # (m, 3, m, 3) at points by forces on others
+    pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
+    pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
+    root = np.linalg.cholesky(pushed)
+    rested = face - under.depth[:, None] * normal
+    wanted = under.depth - (share @ base[:, :, 0].reshape(-1, 3)[nodes]) @ normal
+    for _ in range(2):  # large displacements leave some of the depth
+        force, _ = nnls(root.T, np.linalg.solve(root, wanted))
+        forces = force[:, None] * normal
+        if drag is not None and force.any():
+            forces += _dragging(skin, forces, force > 0, normal, drag)
+        moved = base.reshape(-1).copy()
+        for node, push in zip(nodes.tolist(), share.T @ forces, strict=True):
+            if push.any():
+                moved += soft.responses[node] @ push.astype(np.float32)
+        found = led_through(spread(soft, moved.reshape(base.shape)))
+        wanted = wanted + np.where(force > 0, ((face - moved_to(found, rested)) @ normal), 0)
+    return found
+
+
+class _Under(NamedTuple):
+    """The skin under points of a face."""
+
+    nodes: NDArray[np.int64]  # (m, 4) of the skin around each
+    weights: Array  # (m, 4)
+    depth: Array  # (m,) mm, of the point below the skin; negative above it
+
+
+def _under(soft: ElasticBody, face: Array, normal: Array) -> _Under:
+    """The resting skin under each point of a face, along its normal."""
+    mesh = soft.mesh
+    depth = np.zeros(len(face))
+    for _ in range(6):  # the skin is a height over x and y, the normal is oblique
+        place = face - depth[:, None] * normal
+        i, a = _between(place[:, 0], mesh.x)
+        j, b = _between(place[:, 1], mesh.y)
+        weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], axis=1)
+        nodes = np.stack([i, i, i + 1, i + 1], axis=1) * len(mesh.y) + np.stack([j, j + 1, j, j + 1], axis=1)
+        height = (weights * mesh.skin.ravel()[nodes]).sum(axis=1)
+        depth += (place[:, 2] - height) / normal[2]
+    return _Under(nodes, weights, depth)
+
+
+def _between(values: Array, nodes: Array) -> tuple[NDArray[np.int64], Array]:
+    step = nodes[1] - nodes[0]
+    share = np.clip((values - nodes[0]) / step, 0, len(nodes) - 1)
+    first = np.minimum(share.astype(int), len(nodes) - 2)
+    return first, share - first
+
+
+def _dragging(skin: Array, pushing: Array, touching: NDArray[np.bool_], normal: Array, drag: Array) -> Array:
+    """Forces : (m, 3) by which points that touch the skin draw it along, square to the normal."""
+    across = np.linalg.svd(normal[None])[2][1:]  # (2, 3)
+    some = np.flatnonzero(touching)
+    wanted = np.tile(across @ drag, (len(some), 1)) - np.einsum("ki,minj,nj->mk", across, skin[some], pushing)
+    matrix = np.einsum("ki,minj,lj->mknl", across, skin[np.ix_(some, range(3), some, range(3))], across)
+    matrix = matrix.reshape(2 * len(some), -1)
+    matrix += 1e-6 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
+    forces = np.zeros_like(pushing)
+    forces[some] = np.linalg.solve(matrix, wanted.ravel()).reshape(-1, 2) @ across
+    return forces
+
+
+def _mesh(surface: Solid, support: Solid | None, element_mm: float) -> Mesh:
+    low, high = surface.mesh.bounds
+    soft = support is not None and support.tissue.soft
+    beside = BESIDE_MM if soft else 0.0
+    x, y = (
+        np.linspace(start - beside, end + beside, int(np.ceil((end - start + 2 * beside) / element_mm)) + 1)
+        for start, end in zip(low[:2], high[:2], strict=True)
+    )
+    ground = float(support.mesh.bounds[0, 2]) if support is not None else float(high[2])
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    middle, within = (low[:2] + high[:2]) / 2, 1 - 1e-4  # a little within, or a side would be missed
+    skin = top(surface, middle + within * (places - middle)).reshape(len(x), len(y))
+    skin = np.where(np.isfinite(skin), np.minimum(skin, ground), ground)
+    base = ground + (HELD_MM if soft else 0.0)
+    height = base - skin
+    kept = np.minimum.reduce([height[:-1, :-1], height[:-1, 1:], height[1:, :-1], height[1:, 1:]]) >= LEAST_MM
+    return Mesh(x, y, skin, base, kept)
+
+
+def _moduli(body: Body, mesh: Mesh) -> Array:
+    """Young's modulus, kPa, of all elements : (nx - 1, ny - 1, nz - 1): the mean of the tissues at some of its points."""
+    soft = [tissue.modulus_kpa for tissue in body.tissues]
+    nodes = mesh.nodes()
+    inside = [(np.arange(n) + 0.5) / n for n in SAMPLES]
+    shares = np.stack(np.meshgrid(*inside, indexing="ij"), axis=-1).reshape(-1, 3)
+    total, count = np.zeros(np.subtract(nodes.shape[:3], 1)), 0
+    for a, b, c in shares:
+        low = (1 - a) * nodes[:-1] + a * nodes[1:]
+        low = (1 - b) * low[:, :-1] + b * low[:, 1:]
+        points = (1 - c) * low[:, :, :-1] + c * low[:, :, 1:]
+        labels = np.zeros(points.shape[:3], np.int64)
+        in_threads(_label, len(points), labels, points, body.packed())
+        values = np.array(soft)[labels]
+        total += np.where(labels > 0, values, 0)
+        count = count + (labels > 0)
+    modulus = total / np.maximum(count, 1)
+    softest = np.quantile(modulus[count > 0], 0.01)
+    return np.clip(modulus, softest, STIFFEST * softest)
+
+
+@kernel
+def _label(first, end, labels, points, solids):
+    for i in range(first, end):
+        for j in range(labels.shape[1]):
+            for k in range(labels.shape[2]):
+                labels[i, j, k] = label_at(solids, points[i, j, k, 0], points[i, j, k, 1], points[i, j, k, 2])
+
+
+def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
+    """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty."""
+    nx, ny, nz = (*mesh.skin.shape, len(LAYERS) + 1)
+    number = np.arange(nx * ny * nz).reshape(nx, ny, nz)
+    corner = {(i, j, k): number[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i in (0, 1) for j in (0, 1) for k in (0, 1)}
+    order = [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]  # of scikit-fem's corners
+    kept = np.broadcast_to(mesh.kept[..., None], modulus.shape)
+    cells = np.stack([corner[place][kept] for place in order])
+    used = np.unique(cells)
+    compact = np.full(number.size, -1)
+    compact[used] = np.arange(len(used))
+    hexes = skfem.MeshHex(mesh.nodes().reshape(-1, 3)[used].T.copy(), compact[cells])
+    shear = modulus[kept] / 3
+    element = skfem.ElementVector(skfem.ElementHex1())
+
+    @skfem.BilinearForm
+    def deviatoric(u, v, w):
+        strain = sym_grad(u)
+        return 2 * w["shear"] * ddot(strain - eye(trace(strain) / 3, 3), sym_grad(v))
+
+    @skfem.BilinearForm
+    def volumetric(u, v, w):
+        return w["bulk"] * div(u) * div(v)
+
+    whole, middle = (skfem.Basis(hexes, element, intorder=order) for order in (2, 1))
+    each = {basis: shear[:, None] * np.ones((1, basis.dx.shape[1])) for basis in (whole, middle)}
+    bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))
+    matrix = deviatoric.assemble(whole, shear=each[whole]) + volumetric.assemble(middle, bulk=bulk * each[middle])
+    places = np.empty(matrix.shape[0], np.int64)
+    places[whole.nodal_dofs.T.ravel()] = (3 * used[:, None] + np.arange(3)).ravel()
+    found = matrix.tocoo()
+    size = 3 * number.size
+    return sparse.csr_matrix((found.data, (places[found.row], places[found.col])), (size, size))
+
+
+def spread(soft: ElasticBody, moved: Array) -> Displacement:
+    """Displacements of a body's nodes : (nx, ny, nz, 3) mm on a grid, as between the nodes; beyond the body as at its border."""
+    mesh = soft.mesh
+    first = np.array([mesh.x[0], mesh.y[0], mesh.skin.min() - GRID_MM])
+    last = np.array([mesh.x[-1], mesh.y[-1], mesh.base + GRID_MM])
+    counts = np.ceil((last - first) / GRID_MM).astype(int) + 1
+    found = np.zeros((*counts, 3), np.float32)
+    in_threads(_spread, counts[0], found, np.ascontiguousarray(moved, float), mesh, mesh.shares, first, GRID_MM)
+    return displacement(first, GRID_MM, found)
+
+
+@kernel
+def _spread(start, end, found, moved, mesh, shares, first, step):
+    nx, ny, nz, _ = moved.shape
+    per_x, per_y = 1 / (mesh.x[1] - mesh.x[0]), 1 / (mesh.y[1] - mesh.y[0])
+    for gi in range(start, end):
+        gx = min(max((first[0] + step * gi - mesh.x[0]) * per_x, 0.0), nx - 1.0)
+        i = min(int(gx), nx - 2)
+        a = gx - i
+        for gj in range(found.shape[1]):
+            gy = min(max((first[1] + step * gj - mesh.y[0]) * per_y, 0.0), ny - 1.0)
+            j = min(int(gy), ny - 2)
+            b = gy - j
+            w = (1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b
+            skin = w[0] * mesh.skin[i, j] + w[1] * mesh.skin[i, j + 1]
+            skin += w[2] * mesh.skin[i + 1, j] + w[3] * mesh.skin[i + 1, j + 1]
+            k = 0
+            for gk in range(found.shape[2]):
+                share = (first[2] + step * gk - skin) / max(mesh.base - skin, 1e-6)
+                share = min(max(share, 0.0), 1.0)
+                while k < nz - 2 and share > shares[k + 1]:
+                    k += 1
+                c = (share - shares[k]) / (shares[k + 1] - shares[k])
+                c = min(max(c, 0.0), 1.0)
+                for n in range(3):
+                    upper = w[0] * moved[i, j, k, n] + w[1] * moved[i, j + 1, k, n]
+                    upper += w[2] * moved[i + 1, j, k, n] + w[3] * moved[i + 1, j + 1, k, n]
+                    lower = w[0] * moved[i, j, k + 1, n] + w[1] * moved[i, j + 1, k + 1, n]
+                    lower += w[2] * moved[i + 1, j, k + 1, n] + w[3] * moved[i + 1, j + 1, k + 1, n]
+                    found[gi, gj, gk, n] = (1 - c) * upper + c * lower
