@@ -18,12 +18,10 @@ from threading import Lock
 from typing import NamedTuple
 
 import numpy as np
-import skfem
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
-from skfem.helpers import ddot, div, eye, sym_grad, trace
 from threadpoolctl import threadpool_limits
 
 from recon.compiled import kernel
@@ -305,6 +303,9 @@ def _label(first, end, labels, points, solids):
 
 def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
     """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty."""
+    import skfem  # takes half a second, which bodies that keep their form do without
+    from skfem.helpers import ddot, div, eye, sym_grad, trace
+
     nx, ny, nz = (*mesh.skin.shape, len(LAYERS) + 1)
     number = np.arange(nx * ny * nz).reshape(nx, ny, nz)
     corner = {(i, j, k): number[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i in (0, 1) for j in (0, 1) for k in (0, 1)}
