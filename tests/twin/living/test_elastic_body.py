@@ -1,0 +1,160 @@
+"""The body that yields against other finite elements, the conditions of contact, and what rigid motion must do."""
+
+import numpy as np
+import pytest
+import skfem
+import trimesh
+from scipy.sparse.linalg import splu
+from skfem.helpers import ddot, det, grad, inv, mul, trace, transpose
+
+from scenes.scene_types import Material, Scene, Thing
+from twin.displacement import moved_to, volume_ratio
+from twin.living import elastic_body
+from twin.ultrasound.echo_solids import body
+
+SIZE, TOP = np.array([80.0, 60.0, 30.0]), 650.0
+DOWN = np.array([0.0, 0.0, 1.0])
+
+
+def block():
+    """A block of silicone on a hard base."""
+    box = trimesh.creation.box(SIZE)
+    box.apply_translation([0, 0, TOP + SIZE[2] / 2])
+    return body(Scene("breast", (Thing("breast", box, Material(0.4)),)))
+
+
+def foot(depth_mm, half=(20.0, 6.0), radius=15.0):
+    """Points of a foot, rounded across, that stands in the block by a depth."""
+    x, y = np.meshgrid(np.linspace(-half[0], half[0], 17), np.linspace(-half[1], half[1], 7), indexing="ij")
+    return np.stack([x, y, TOP + depth_mm - y**2 / (2 * radius)], axis=-1).reshape(-1, 3)
+
+
+@pytest.fixture(scope="module")
+def soft():
+    there = block()
+    return elastic_body.elastic_body(there, there.solids[0], None)
+
+
+@pytest.fixture(scope="module")
+def pressed(soft):
+    return elastic_body.press(soft, foot(2.0), DOWN)
+
+
+def quarter(shape=(8, 7, 6)):
+    """A quarter of the block: nodes that quadratic elements need, and which of them the block's skin, base and middle hold."""
+    graded = SIZE[2] * np.linspace(0, 1, shape[2] + 1) ** 1.4
+    mesh = skfem.MeshHex.init_tensor(np.linspace(0, SIZE[0] / 2, shape[0] + 1), np.linspace(0, SIZE[1] / 2, shape[1] + 1), graded)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4)
+    axis = np.zeros(basis.N, int)
+    for numbers in (basis.dofs.nodal_dofs, basis.dofs.edge_dofs, basis.dofs.facet_dofs, basis.dofs.interior_dofs):
+        for k in range(3):
+            axis[numbers[k::3]] = k
+    return basis, axis
+
+
+def neo_hookean(skin):
+    """Displacements of an incompressible neo-Hookean quarter whose skin is moved as given; Taylor-Hood elements, Newton's steps."""
+    basis, axis = quarter()
+    pressures = basis.with_element(skfem.ElementHex1())
+    places = basis.doflocs
+    points = places.T + [0, 0, TOP]
+    moved = (moved_to(skin, points) - points)[np.arange(basis.N), axis]
+    held = np.isclose(places[2], SIZE[2]) | np.isclose(places[2], 0)
+    held |= (np.isclose(places[0], 0) & (axis == 0)) | (np.isclose(places[1], 0) & (axis == 1))
+    u, p = (
+        np.where(np.isclose(places[0] * (axis == 0) + places[1] * (axis == 1), 0) & (axis < 2), 0.0, moved),
+        -np.ones(pressures.N),
+    )
+    free = np.concatenate([np.flatnonzero(~held), basis.N + np.arange(pressures.N)])
+
+    @skfem.BilinearForm
+    def stiffness(du, v, w):
+        stretch = grad(w["u"]) + np.eye(3)[:, :, None, None]
+        back, change = inv(stretch), grad(du)
+        turned = transpose(back)
+        volume = trace(mul(back, change)) * ddot(turned, grad(v)) - ddot(transpose(mul(back, mul(change, back))), grad(v))
+        return ddot(change, grad(v)) + w["p"] * det(stretch) * volume
+
+    @skfem.BilinearForm
+    def coupling(du, q, w):
+        stretch = grad(w["u"]) + np.eye(3)[:, :, None, None]
+        return q * det(stretch) * ddot(transpose(inv(stretch)), grad(du))
+
+    @skfem.LinearForm
+    def forces(v, w):
+        stretch = grad(w["u"]) + np.eye(3)[:, :, None, None]
+        return ddot(stretch, grad(v)) + w["p"] * det(stretch) * ddot(transpose(inv(stretch)), grad(v))
+
+    @skfem.LinearForm
+    def volumes(q, w):
+        return q * (det(grad(w["u"]) + np.eye(3)[:, :, None, None]) - 1)
+
+    for _ in range(12):
+        there = {"u": basis.interpolate(u), "p": pressures.interpolate(p)}
+        rows = coupling.assemble(basis, pressures, **there)
+        matrix = skfem.bmat([[stiffness.assemble(basis, **there), rows.T], [rows, None]], "csc")
+        off = np.concatenate([forces.assemble(basis, **there), volumes.assemble(pressures, **there)])
+        step = np.zeros(len(off))
+        step[free] = splu(matrix[free][:, free].tocsc()).solve(-off[free])
+        u, p = u + step[: basis.N], p + step[basis.N :]
+        if np.abs(step[: basis.N]).max() < 1e-6:
+            break
+    else:
+        raise AssertionError("expected Newton's steps to end")
+    nodes = basis.mesh.p.T + [0, 0, TOP]
+    return nodes, np.stack([u[basis.nodal_dofs[k]] for k in range(3)], axis=1)
+
+
+def test_displacements_are_those_of_a_neo_hookean_body_with_the_same_skin(pressed):
+    nodes, expected = neo_hookean(pressed)
+    inner = (nodes[:, 2] > TOP + 1) & (nodes[:, 2] < TOP + SIZE[2] - 1)
+    found = moved_to(pressed, nodes) - nodes
+    off = np.linalg.norm(found - expected, axis=1)[inner]
+    print(off.max(), np.sqrt(np.mean(off**2)), np.linalg.norm(expected[inner], axis=1).max())
+    assert np.sqrt(np.mean(off**2)) < 0.05 * np.sqrt(np.mean(np.sum(expected[inner] ** 2, axis=1)))
+    assert off.max() < 0.05 * 2.0
+
+
+def test_tissue_keeps_its_volume(pressed):
+    ratio = volume_ratio(pressed)
+    x, y, z = (start + 2.5 * (np.arange(count) + 0.5) for start, count in zip(pressed.first, ratio.shape, strict=True))
+    inner = np.ix_(np.abs(x) < SIZE[0] / 2 - 3, np.abs(y) < SIZE[1] / 2 - 3, (z > TOP + 2) & (z < TOP + SIZE[2] - 2))
+    assert np.abs(ratio[inner].mean() - 1) < 1e-3
+    assert np.quantile(np.abs(ratio[inner] - 1), 0.99) < 0.01
+
+
+def test_the_skin_lies_in_the_foot_or_below_it(pressed):
+    places = foot(2.0)
+    skin = np.column_stack([places[:, :2], np.full(len(places), TOP)])
+    gap = moved_to(pressed, skin)[:, 2] - places[:, 2]  # below the foot
+    touched = np.abs(places[:, 1]) < 4.5
+    assert np.abs(gap[touched]).max() < 0.1
+    assert gap.min() > -0.15
+
+
+def test_a_foot_above_the_skin_pushes_nothing(soft):
+    lifted = elastic_body.press(soft, foot(-0.5), DOWN)
+    assert np.abs(lifted.moved).max() == 0
+
+
+def test_skin_is_drawn_along_by_a_foot_that_slides(soft, pressed):
+    drawn = elastic_body.press(soft, foot(2.0), DOWN, drag=np.array([0.0, 1.0, 0.0]))
+    under = np.array([[0.0, 0.0, TOP], [10.0, 0.0, TOP]])
+    aside = (moved_to(drawn, under) - moved_to(pressed, under))[:, 1]
+    assert aside == pytest.approx([1, 1], abs=0.15)
+    far = np.array([[0.0, 25.0, TOP + 25.0]])
+    assert abs((moved_to(drawn, far) - moved_to(pressed, far))[0, 1]) < 0.1
+
+
+def test_a_body_goes_along_with_its_base(soft):
+    shift = np.array([0.3, -0.2, 0.5])
+    moved = soft.moved_base(np.broadcast_to(shift, (*soft.size[:2], 3)))
+    np.testing.assert_allclose(moved, np.broadcast_to(shift, moved.shape), atol=1e-6)
+
+
+def test_responses_have_the_same_bits_in_any_order(soft):
+    other = elastic_body.elastic_body(block(), block().solids[0], None)
+    nodes = np.array([5 * soft.size[1] + 7, 9 * soft.size[1] + 3])
+    soft.respond(nodes)
+    other.respond(nodes[::-1])
+    assert all((soft.responses[node] == other.responses[node]).all() for node in nodes.tolist())
