@@ -122,17 +122,29 @@ def expose(radiance: Stack, device: CameraDevice, wavelength_nm: float, exposure
     readout = readout_of(device, wavelength_nm, exposure)
     numbers = np.empty((count, *shape), np.uint8 if exposure.bits == 8 else np.uint16)
 
-    def take(k: int, stream: np.random.SeedSequence) -> None:
-        generator = np.random.default_rng(stream)
-        if sensor.dark_noise_e >= SMOOTHING_E:
-            normal = generator.standard_normal(tuple(shape), np.float32)
-            _take(radiance[k], normal, response, offset, readout, numbers[k])
-            return
-        mean = np.maximum(radiance[k] * readout.scale * response, 0) + readout.dark_e
-        numbers[k] = digitise(read_out(mean, sensor.dark_noise_e, generator) + offset, sensor, exposure)
+    def one(k: int, stream: np.random.SeedSequence) -> None:
+        numbers[k] = sensed(radiance[k], (response, offset), readout, sensor, exposure, np.random.default_rng(stream))
 
-    list(mapped(take, range(count), np.random.SeedSequence(seed).spawn(count)))
+    list(mapped(one, range(count), np.random.SeedSequence(seed).spawn(count)))
     return numbers
+
+
+def sensed(
+    radiance: Images,
+    pattern: tuple[Images, Images],
+    readout: Readout,
+    sensor: Sensor,
+    exposure: Exposure,
+    generator: np.random.Generator,
+) -> Numbers:
+    """Take one image : (h, w), with the fixed pattern's response and offset."""
+    response, offset = pattern
+    if sensor.dark_noise_e >= SMOOTHING_E:
+        numbers = np.empty(radiance.shape, np.uint8 if exposure.bits == 8 else np.uint16)
+        _take(radiance, generator.standard_normal(radiance.shape, np.float32), response, offset, readout, numbers)
+        return numbers
+    mean = np.maximum(radiance * readout.scale * response, 0) + readout.dark_e
+    return digitise(read_out(mean, sensor.dark_noise_e, generator) + offset, sensor, exposure)
 
 
 def dropped_bits(sensor: Sensor, exposure: Exposure) -> int:
@@ -144,10 +156,16 @@ def dropped_bits(sensor: Sensor, exposure: Exposure) -> int:
 
 def readout_of(device: CameraDevice, wavelength_nm: float, exposure: Exposure) -> Readout:
     """Of a camera."""
-    sensor, dropped = device.sensor, dropped_bits(device.sensor, exposure)
+    scale = electrons_per_radiance(device, wavelength_nm) * exposure.time_s
+    return readout_by(device.sensor, exposure, scale, device.sensor.dark_current_e_per_s * exposure.time_s)
+
+
+def readout_by(sensor: Sensor, exposure: Exposure, scale: float, dark_e: float = 0.0) -> Readout:
+    """Of a sensor, by the electrons of a radiance of 1 and those of the dark current."""
+    dropped = dropped_bits(sensor, exposure)
     return Readout(
-        np.float32(electrons_per_radiance(device, wavelength_nm) * exposure.time_s),
-        np.float32(sensor.dark_current_e_per_s * exposure.time_s),
+        np.float32(scale),
+        np.float32(dark_e),
         np.float32(sensor.dark_noise_e**2),
         np.float32(number_per_electron(sensor, exposure) * 2**dropped),
         np.float32(sensor.black_level_dn * 2 ** (sensor.adc_bits - 8)),

@@ -28,13 +28,15 @@ class FilmQuality(Part):
     """Rays a pixel of a film's frames, powers of two."""
 
     view: int = Field(default=1, ge=1, le=256)
-    """of cells of 4 px, and of 2 px about the target's board"""
-    disc: int = Field(default=2, ge=1, le=256)
+    """of each pixel of what stands still, once a film, of cells of 8 px in each frame, and of 2 px about bodies and in shadows"""
+    outline: int = Field(default=4, ge=2, le=256)
+    """of each pixel of outlines"""
+    disc: int = Field(default=1, ge=1, le=256)
     """of each pixel of the circles"""
     rim: int = Field(default=8, ge=2, le=1024)
     """of those at their rims, and of every pixel of full frames"""
 
-    _power_of_two = field_validator("view", "disc", "rim")(power_of_two)
+    _power_of_two = field_validator("view", "outline", "disc", "rim")(power_of_two)
 
 
 class Shooting(Part):

@@ -12,10 +12,13 @@ from skimage.measure import marching_cubes
 
 from scenes.handheld import lofts
 from scenes.handheld.mesh_parts import Part
+from scenes.noise import smooth_noise
 
 Array = NDArray[np.float64]
 
 VOXEL_MM = 3.5  # some 13 000 triangles a hand
+CLOSE_MM = 1.5  # of a hand that is looked at closely, whose creases and nails are resolved: some 80 000
+SKIN = (0.25, 0.5)  # reflectance of a hand that is looked at closely
 SEGMENTS_MM = np.array([[46, 27, 22], [50, 31, 23], [46, 28, 23], [36, 21, 20]], float)  # index to little finger of an adult
 RADII_MM = np.array([9.2, 9.4, 8.8, 7.8])  # of the fingers at their roots
 THUMB_MM = np.array([34.0, 28.0])
@@ -43,6 +46,11 @@ class Skeleton:
     forearm: Array  # (3,), unit, from the wrist to the elbow
     broad: Array  # (3,), unit, along which the forearm is broad
     size: float  # 1 for a man's hand of average size
+
+    @property
+    def digits(self) -> list[tuple[Bone, ...]]:
+        """Bones of the thumb's two free joints, and of each finger, index to little finger."""
+        return [self.bones[10:12], *(self.bones[first : first + 3] for first in range(12, 24, 3))]
 
     def points(self) -> Array:
         """Points along the bones : (n, 4), x y z and the radius there, mm."""
@@ -183,6 +191,8 @@ def skin(hand: Skeleton, arm_mm: float, voxel: float = VOXEL_MM) -> trimesh.Trim
         here = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
         axes = [(low[k] + voxel * np.arange(first[k], last[k])).astype(np.float32) for k in range(3)]
         field[here] = _smooth_minimum(field[here], _distance(bone, axes), bone.blend)
+    if voxel <= CLOSE_MM:  # a level that passes next to a corner of a voxel leaves slivers there, whose normals show as specks
+        field = np.copysign(np.maximum(np.abs(field), np.float32(0.1 * voxel)), field)
     vertices, faces, _, _ = marching_cubes(field, 0.0, spacing=(voxel,) * 3)
     hand_mesh = trimesh.Trimesh(vertices.astype(float) + low, faces, process=False)
     if hand_mesh.volume < 0:
@@ -214,8 +224,73 @@ def _cuff(hand: Skeleton, start_mm: float, end_mm: float, thick_mm: float) -> tr
     return lofts.loft(rings)
 
 
-def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
-    """Skin, and a sleeve, the cuff of a glove, a watch or nothing on the forearm."""
+def look(rng: np.random.Generator, hand: Skeleton, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, NDArray[np.float32]]:
+    """The skin with creases at the joints, tendons over the back of the hand and nails, and its reflectance : (vertices,).
+
+    Creases are paler within and darker along their bottoms, nails paler and knuckles darker than the rest, which is mottled.
+    """
+    vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    raised, shade = np.zeros(len(vertices)), np.ones(len(vertices))
+    for digit in hand.digits:
+        joints = np.array([digit[0].start, *(bone.end for bone in digit)])
+        ways = [lofts.unit(bone.end - bone.start) for bone in digit]
+        axis = np.cross(ways[0], ways[-1])
+        axis = lofts.unit(axis) if np.linalg.norm(axis) > 1e-3 else hand.broad
+        bulge = joints[1:-1].mean(axis=0) - joints[[0, -1]].mean(axis=0)
+        axis = axis if np.cross(axis, ways[0]) @ bulge > 0 else -axis  # the back is outside of the bend
+        for k, (bone, way) in enumerate(zip(digit, ways, strict=True)):
+            radius, from_tip = bone.radii[1], vertices - bone.end
+            if k + 1 < len(digit):
+                way = lofts.unit(way + ways[k + 1])
+            back = np.cross(axis, way)
+            along, out, aside = from_tip @ way, from_tip @ back, from_tip @ axis
+            about = np.hypot(out, aside) < 1.7 * radius
+            if k + 1 < len(digit):
+                behind = 1 / (1 + np.exp(-4 * out / radius))  # 1 on the back, 0 on the palm's side
+                fold = np.exp(-((along / 1.1) ** 2)) * (1 - behind) + 0.4 * behind * _folds(along)
+                raised -= 0.9 * about * fold
+                shade *= 1 - 0.25 * about * fold
+                shade *= 1 - 0.1 * behind * np.exp(-(np.sum(from_tip**2, axis=1) / (1.6 * radius) ** 2))
+            else:
+                over = (np.abs((along + 0.35 * radius) / radius) ** 3 + np.abs(aside / (0.68 * radius)) ** 3) ** (
+                    1 / 3
+                )  # 1 at the rim
+                nail = (out > 0.3 * radius) & (out < 1.5 * radius)
+                rim = np.exp(-(((over - 1.1) / 0.14) ** 2))
+                raised -= 0.35 * nail * rim
+                shade *= 1 + nail * (0.2 / (1 + np.exp(20 * np.minimum(over - 1, 2))) - 0.12 * rim)
+    back = np.cross(hand.broad, hand.forearm)
+    back = back if back @ (np.mean([bone.end for bone in hand.bones[2:6]], axis=0) - _middle(hand)) > 0 else -back
+    for bone in hand.bones[2:6]:
+        part = np.clip((vertices - bone.start) @ (bone.end - bone.start) / np.sum((bone.end - bone.start) ** 2), 0, 1)
+        away = vertices - bone.start - part[:, None] * (bone.end - bone.start)
+        aside = away - (away @ back)[:, None] * back
+        on_back = (away @ back > 0) & (np.linalg.norm(away, axis=1) < 1.6 * max(bone.radii))
+        raised += 1.1 * on_back * np.exp(-np.sum(aside**2, axis=1) / 2.6**2) * np.sin(np.pi * np.clip(part, 0.05, 1)) ** 0.5
+    mottled = 0.05 * smooth_noise(vertices, 25.0, rng) + 0.03 * smooth_noise(vertices, 5.0, rng)
+    albedo = rng.uniform(*SKIN) * shade * np.exp(mottled)
+    return trimesh.Trimesh(vertices + raised[:, None] * normals, mesh.faces, process=False), np.float32(albedo)
+
+
+def _folds(along: Array) -> Array:
+    """Three wrinkles across a knuckle."""
+    return sum(np.exp(-(((along - place) / 0.8) ** 2)) for place in (-3.2, 0.0, 3.2))
+
+
+def _middle(hand: Skeleton) -> Array:
+    """Of the fingers, which lie on the palm's side of the knuckles."""
+    return np.mean([bone.end for digit in hand.digits[1:] for bone in digit[1:]], axis=0)
+
+
+def _skin_part(rng: np.random.Generator, hand: Skeleton, arm_mm: float, voxel: float) -> Part:
+    mesh, albedo = skin(hand, arm_mm, voxel), None
+    if voxel <= CLOSE_MM:
+        mesh, albedo = look(rng, hand, mesh)
+    return Part("skin", mesh, True, albedo)
+
+
+def clothed(rng: np.random.Generator, skeleton: Skeleton, voxel: float = VOXEL_MM) -> list[Part]:
+    """Skin, of voxels some mm wide, and a sleeve, the cuff of a glove, a watch or nothing on the forearm."""
     kind = rng.choice(["sleeve", "watch", "glove", "bare"], p=[0.4, 0.2, 0.12, 0.28])
     if kind == "sleeve":
         start = rng.uniform(5, 110)
@@ -234,8 +309,8 @@ def clothed(rng: np.random.Generator, skeleton: Skeleton) -> list[Part]:
         start, bare = rng.uniform(0, 15), rng.uniform(280, 380)
         cloth = _cuff(skeleton, start, start + rng.uniform(40, 90), rng.uniform(1.5, 4))
     else:
-        return [Part("skin", skin(skeleton, rng.uniform(280, 380)), True)]
-    return [Part("skin", skin(skeleton, bare), True), Part("sleeve", cloth, True)]
+        return [_skin_part(rng, skeleton, rng.uniform(280, 380), voxel)]
+    return [_skin_part(rng, skeleton, bare, voxel), Part("sleeve", cloth, True)]
 
 
 def _arm(along: ArrayLike, size: float) -> tuple[Array, Array]:

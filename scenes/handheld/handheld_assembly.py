@@ -16,6 +16,7 @@ from recon.model import circle_layout
 from recon.model.circle_layout import circle_centres
 from recon.model.rig import Probe, Target
 from scenes.handheld import lofts
+from scenes.handheld.hand import CLOSE_MM
 from scenes.handheld.holders import grip, pinch, robot
 from scenes.handheld.mesh_parts import Part
 from scenes.handheld.probe_bodies import LENS_MM, Body, body, lens, parts_of, scaled
@@ -105,7 +106,7 @@ def as_designed(
 
     grips = 160  # of a hand that leaves the circles free
     any_grip = (0.15, 0.85)  # levels at which a probe close beside its board can be held, too
-    parts += grip(holder_rng, housing, target_from_body, beside, in_the_way, any_grip, grips)
+    parts += grip(holder_rng, housing, target_from_body, beside, in_the_way, any_grip, grips, CLOSE_MM)
     parts += _cable(cable_rng, housing, target_from_body, beside, None, target.outer_diameter_mm / 2)
     return tuple(parts)
 

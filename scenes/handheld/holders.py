@@ -25,6 +25,7 @@ def grip(
     refused: Callable[[Array], bool],
     levels: tuple[float, float] = (0.3, 0.68),
     tries: int = TRIES,
+    voxel: float = hands.VOXEL_MM,
 ) -> list[Part]:
     """A hand around the probe at a level, a part of its length, its forearm leading away from the board; none if all are refused.
 
@@ -41,7 +42,7 @@ def grip(
         arm = skeleton.wrist + np.linspace(0, 300, 20)[:, None] * skeleton.forearm
         balls = np.concatenate([skeleton.points(), np.column_stack([arm, np.full(20, 45.0)])])
         if skeleton.forearm[2] < 0.75 and not refused(balls):
-            return hands.clothed(rng, skeleton)
+            return hands.clothed(rng, skeleton, voxel)
     return []
 
 

@@ -1,16 +1,18 @@
-"""A frame of a film, rendered where it matters: one ray in many pixels at large, more about the target, most at its rims.
+"""Frames of a film: held bodies, rendered anew in each, before and above a scene that stands still and is rendered once.
 
-Three layers lie on each other: cells of 4 px all over, cells of 2 px about the target's board, and every pixel of the board's
-edges and of the circles as far out as a fit of their rims looks; the last with more rays at the rims, where a pixel's share of
-ink is the noise. Rays between are interpolated.
+A frame is `held_plain * held_arriving + (1 - cover) * still * arriving`: light that bodies reflect, as far as it arrives on them,
+and the still scene's, where bodies don't cover it, as far as they throw no shadow on it. Reflected light is known exactly by each
+ray; light that arrives is smooth but for sharp shadows, and few shadow rays know it badly. So it is averaged over the cells about
+each, on bodies and on the scene apart, that neither's brightness shows beside the other's outline.
 
-How much of the unshadowed light arrives is smooth but for sharp shadows, and it is what few shadow rays know badly: on plain
-paper it would scatter by a tenth. So it is averaged over the cells about each, and the pixels take that of the cells beneath;
-what the surface reflects is not averaged, and keeps its edges.
+Rays are spent in four passes, each where the one before it found something: cells of 8 px all over; cells of 4 px about bodies
+and at the borders of their shadows; without shadow rays, cells of 2 px on bodies; and pixels, at outlines with several rays, and
+of the targets' circles as far out as a fit of their rims looks, with most at these, where a pixel's share of ink is the noise.
+Rays between are interpolated.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,53 +22,52 @@ from recon.geometry import rigid
 from recon.model.rig import CameraDevice, Target
 from twin.shooting import FilmQuality
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, circle_number
-from twin.tracking.pixel_selection import joined, lanes_of
-from twin.tracking.samples import Held, Take
-from twin.tracking.target_truth import ViewTruth, board_corners
+from twin.tracking.pixel_selection import lanes_of
+from twin.tracking.samples import Held
+from twin.tracking.target_truth import ViewTruth
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
-CELL_PX, NEAR_CELL_PX = 4, 2
-AROUND_PX = 24  # beyond the target's board
+FIRST_PX, NEAR_PX, FINE_PX = 8, 4, 2  # cells of the first passes
+SHADOWS = 4  # shadow rays of a ray of cells, a power of two
+SHOWN = 0.02  # of the target's white, by which neighbours differ that aren't interpolated: as much as noise at 65 DN
+SHADE, CONTRAST = 0.03, 0.12  # likewise of cells in shadow, and at outlines
 BEYOND = 0.42  # radii beyond a circle's rim: a fit of the rim reaches to 0.37
 RIM_PX = 4.0  # on either side of a rim, and half of the motion's blur
 LINE_PX = 16.0  # about a thin part
 TILE = 4  # cells along each axis, among which the points of one set are dealt out: alike in all tiles, which leaves no noise
+ABOUT = np.ones((3, 3), np.uint8)  # a cell and its neighbours
 
 
 @dataclass(frozen=True)
 class Cells:
-    """A rectangle of the image in cells with one lane in the middle of each."""
+    """An image in square cells, of which some have a lane in their middle."""
 
-    first: tuple[int, int]  # its upper left pixel
-    extent: tuple[int, int]  # width, height, px
+    size: tuple[int, int]  # width, height of the image, px
     cell: int  # px
     samples: int
+    chosen: Mask  # (rows, columns)
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of cells."""
-        width, height = self.extent
-        return -(-height // self.cell), -(-width // self.cell)
+    @classmethod
+    def all_over(cls, size: tuple[int, int], cell: int, samples: int) -> "Cells":
+        """Each with a lane."""
+        return cls(size, cell, samples, np.ones((-(-size[1] // cell), -(-size[0] // cell)), bool))
 
     def lanes(self, take: int, camera: int) -> Lanes:
-        """Lanes, row by row."""
-        rows, columns = self.shape
-        v = self.first[1] + (np.arange(rows) + 0.5) * self.extent[1] / rows - 0.5
-        u = self.first[0] + (np.arange(columns) + 0.5) * self.extent[0] / columns - 0.5
-        v, u = np.broadcast_arrays(v[:, None], u)
-        row, column = np.indices(u.shape)
+        """Lanes, row by row; of one set for all, or cells of different sizes would differ."""
+        row, column = np.nonzero(self.chosen)
+        rows, columns = self.chosen.shape
+        v, u = (row + 0.5) * self.size[1] / rows - 0.5, (column + 0.5) * self.size[0] / columns - 0.5
         first = ((row % TILE) * TILE + column % TILE) * self.samples
-        return lanes_of(take, camera, u, v, self.samples, np.zeros(u.size), first)  # one set for all, or layers would differ
+        return lanes_of(take, camera, u, v, self.samples, np.zeros(u.size), first)
 
-    def lay(self, image: Image, arrived: Image, light: Light) -> None:
-        """Interpolate the lanes' radiance, and what arrives of the unshadowed light, into the rectangle of images : (h, w)."""
-        plain = light.plain.reshape(self.shape)
-        share = arriving(light.radiance.reshape(self.shape), plain)
-        (u, v), (width, height) = self.first, self.extent
-        for laid, cells in ((image, plain * share), (arrived, share)):
-            laid[v : v + height, u : u + width] = cv2.resize(cells, self.extent, interpolation=cv2.INTER_LINEAR)
+    def spread(self, values: NDArray) -> Image:
+        """Values of the lanes in their cells : (rows, columns), 0 in others."""
+        image = np.zeros(self.chosen.shape, np.float32)
+        image[self.chosen] = values
+        return image
 
 
 @dataclass(frozen=True)
@@ -79,113 +80,135 @@ class Pixels:
     circle: NDArray[np.int64]  # `circle_number` of the one that is nearest, or NO_CIRCLE
 
     def lanes(self, take: int, camera: int) -> Lanes:
-        """Lanes in the same order."""
-        lanes = lanes_of(take, camera, self.u, self.v, 1, 1 + np.arange(self.u.size))
+        """Lanes in the same order, each of a set by its place."""
+        lanes = lanes_of(take, camera, self.u, self.v, 1, 1 + (self.v << 14 | self.u))
         return Lanes(**lanes.__dict__ | {"samples": np.uint32(self.samples), "circle": np.uint32(self.circle)})
-
-    def lay(self, image: Image, arrived: Image, light: Light) -> None:
-        """Put the lanes' radiance into the image : (h, w), of the light that arrives : (h, w) by the layer beneath."""
-        image[self.v, self.u] = light.plain * arrived[self.v, self.u]
 
 
 @dataclass(frozen=True)
-class FilmPicture:
-    """All layers of one camera's frame, from the one at the bottom up."""
+class Arriving:
+    """Share of the unshadowed light that arrives : (rows, columns) each, of cells."""
 
-    size: tuple[int, int]  # width, height
-    layers: Sequence[Cells | Pixels]
+    held: Image  # on bodies
+    scene: Image  # of what arrives on the scene without bodies
 
-    def lanes(self, take: int, camera: int) -> Lanes:
-        """Lanes of all layers."""
-        return joined([layer.lanes(take, camera) for layer in self.layers])
-
-    def radiance(self, light: Light) -> Image:
-        """The image : (h, w), from the light of `lanes`."""
-        image, arrived = np.zeros((2, *self.size[::-1]), np.float32)
-        first = 0
-        for layer in self.layers:
-            count = len(layer.u) if isinstance(layer, Pixels) else layer.shape[0] * layer.shape[1]
-            layer.lay(image, arrived, light.part(slice(first, first + count)))
-            first += count
-        return image
+    @classmethod
+    def of(cls, cells: Cells, light: Light, beyond: Image | None = None) -> "Arriving":
+        """By the light of cells, averaged over those about each; where none is chosen as an image : (rows, columns) has it."""
+        lit, unheld = cells.spread(light.radiance - light.held_radiance), cells.spread(light.unheld_radiance)
+        if beyond is not None and light.unheld_radiance.size:
+            weight = np.where(cells.chosen, 0, light.unheld_radiance.mean())
+            lit, unheld = lit + weight * beyond, unheld + weight
+        scene = arriving(lit, unheld, 1.0)
+        return cls(arriving(cells.spread(light.held_radiance), cells.spread(light.held_plain), scene), scene)
 
 
-def film_picture(
-    take: Take,
-    device: CameraDevice,
-    late: float,
-    targets: Mapping[str, Target],
-    truth: Mapping[str, ViewTruth],
-    quality: FilmQuality,
-) -> FilmPicture:
-    """Layers for a take's frame by one camera, which exposes later by a share of the exposure; targets and truth by body."""
-    size, camera = device.optics.size, device.optics.camera()
-    about, sharp = [], []
-    for number, (name, held) in enumerate(take.held.items()):
-        target = targets[name]
-        near = about_target(held, device, late, target) if held.present else None
-        if near is not None:
-            about.append(Cells(*near, NEAR_CELL_PX, quality.view))
-            pose = held.motion.later(late).world_from_target
-            if held.line is not None:
-                sharp.append(line_pixels(camera.project(rigid.apply(pose, held.line)), truth[name], size, quality))
-            corners = camera.project(rigid.apply(pose, board_corners(target)))
-            sharp.append(sharp_pixels(truth[name], corners, size, target, quality, number))
-    return FilmPicture(size, [Cells((0, 0), size, CELL_PX, quality.view), *about, *sharp])
+def near_cells(cells: Cells, light: Light, still: Image, white: float, lines: Sequence[Array], quality: FilmQuality) -> Cells:
+    """Cells about the bodies that the first ones met, at the borders of their shadows, and about lines : (n, 2) px.
+
+    still : (h, w) radiance of the scene
+    white : radiance of the target's white
+    """
+    scene = Arriving.of(cells, light).scene
+    shaded = contrasts(scene) * resized(still, scene.shape[::-1]) > SHADE * white
+    return finer(cells, _about_bodies(cells, light, lines) | shaded, NEAR_PX, quality)
 
 
-def about_target(held: Held, device: CameraDevice, late: float, target: Target) -> tuple[tuple[int, int], tuple[int, int]] | None:
-    """First pixel, and width and height, of the rectangle about the board on its way; None where the image shows none of it."""
-    motion, camera, size = held.motion.later(late), device.optics.camera(), np.array(device.optics.size)
-    places = np.concatenate([camera.project(rigid.apply(motion.at(time), board_corners(target))) for time in (-0.5, 0.5)])
-    if not np.isfinite(places).all():
-        return None
-    low = np.clip(np.floor(places.min(axis=0)) - AROUND_PX, 0, size)
-    extent = np.clip(np.ceil(places.max(axis=0)) + AROUND_PX + 1, 0, size) - low
-    return (tuple(low.astype(int).tolist()), tuple(extent.astype(int).tolist())) if extent.min() >= 2 else None
+def fine_cells(cells: Cells, light: Light, lines: Sequence[Array], quality: FilmQuality) -> Cells:
+    """Cells about the bodies that the near ones met, and about lines."""
+    return finer(cells, _about_bodies(cells, light, lines), FINE_PX, quality)
 
 
-def line_pixels(places: Array, truth: ViewTruth, size: tuple[int, int], quality: FilmQuality) -> Pixels:
-    """Pixels beside a line through places : (n, 2) px."""
-    mask = np.zeros(size[::-1], np.uint8)
-    width = round(LINE_PX + float(truth.blur_px.max()))
-    cv2.polylines(mask, [np.rint(places).astype(np.int32)], isClosed=False, color=1, thickness=width)
-    v, u = mask.nonzero()
-    return Pixels(u, v, np.full(u.size, quality.disc), np.full(u.size, NO_CIRCLE))
+def _about_bodies(cells: Cells, light: Light, lines: Sequence[Array]) -> Mask:
+    shown = cv2.dilate(np.uint8(cells.spread(light.held) > 0), ABOUT)
+    for line in lines:
+        cv2.polylines(shown, [np.rint(line / cells.cell).astype(np.int32)], isClosed=False, color=1, thickness=3)
+    return shown > 0
+
+
+def finer(cells: Cells, shown: Mask, cell: int, quality: FilmQuality) -> Cells:
+    """Smaller cells where larger ones are shown : (rows, columns)."""
+    whole = Cells.all_over(cells.size, cell, quality.view)
+    return replace(whole, chosen=_enlarged(shown, whole.chosen.shape[::-1]))
+
+
+def _enlarged(mask: Mask, size: tuple[int, int]) -> Mask:
+    return cv2.resize(np.uint8(mask), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def sharp_pixels(
-    truth: ViewTruth, corners: Array, size: tuple[int, int], target: Target, quality: FilmQuality, body: int = 0
+    outlines: Mask,
+    size: tuple[int, int],
+    lines: Sequence[Array],
+    truth: Sequence[ViewTruth],
+    targets: Sequence[Target],
+    quality: FilmQuality,
 ) -> Pixels:
-    """Pixels of the edges of a body's board, between its corners : (4, 2) px, and of the circles, as far out as a fit of their
-    rims looks, with more rays at outer and inner rims.
+    """Pixels of outlines, about lines : (n, 2) px, and of the circles as far out as a fit of their rims looks, with more rays at
+    outer and inner rims.
+
+    outlines : (rows, columns) of cells
+    truth, targets : of each body
     """
-    ratio = target.inner_diameter_mm / target.outer_diameter_mm
-    edges = np.zeros(size[::-1], np.uint8)
-    width = round(2 * RIM_PX + float(truth.blur_px.max()))  # over which they move
-    cv2.polylines(edges, [np.rint(corners).astype(np.int32)], isClosed=True, color=1, thickness=width)
-    v, u = edges.nonzero()
-    found = [np.column_stack([u, v, *(np.full(u.size, value) for value in (quality.disc, NO_CIRCLE, np.inf))])]
-    for k, (row, path) in enumerate(zip(truth.ellipses, truth.blur_px, strict=True)):
-        reach = row[2] * (1 + BEYOND) + path
-        low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)
-        high = np.clip(np.ceil(row[:2] + reach) + 1, 0, size).astype(int)
-        v, u = np.mgrid[low[1] : high[1], low[0] : high[0]].reshape(2, -1)
-        radius = _radii(row, u, v)
-        beyond = (radius - 1) * row[3] - path / 2
-        at_rim = np.minimum(np.abs(radius - 1), np.abs(radius - ratio)) * row[3] < RIM_PX + path / 2
-        rays = np.where(at_rim, quality.rim, quality.disc)
-        found.append(np.column_stack([u, v, rays, np.full(u.size, circle_number(body, k)), radius])[beyond < BEYOND * row[3]])
-    table = np.concatenate(found)
-    table = table[np.argsort(table[:, 4], kind="stable")]  # of pixels that two circles share, those of the nearer
-    _, kept = np.unique(table[:, 1] * size[0] + table[:, 0], return_index=True)
-    u, v, rays, number = table[kept, :4].astype(np.int64).T
-    return Pixels(u, v, rays, number)
+    rays = cv2.resize(outlines.astype(np.int32) * quality.outline, size, interpolation=cv2.INTER_NEAREST)
+    for line in lines:
+        cv2.polylines(rays, [np.rint(line).astype(np.int32)], isClosed=False, color=quality.outline, thickness=round(LINE_PX))
+    number, nearest = np.full(rays.shape, NO_CIRCLE, np.int64), np.full(rays.shape, np.inf, np.float32)
+    for body, (view, target) in enumerate(zip(truth, targets, strict=True)):
+        ratio = target.inner_diameter_mm / target.outer_diameter_mm
+        for k, (row, path) in enumerate(zip(view.ellipses, view.blur_px, strict=True)):
+            if not np.isfinite(row).all():
+                continue
+            reach = row[2] * (1 + BEYOND) + path
+            low = np.clip(np.floor(row[:2] - reach), 0, size).astype(int)
+            high = np.clip(np.ceil(row[:2] + reach) + 1, 0, size).astype(int)
+            here = np.s_[low[1] : high[1], low[0] : high[0]]
+            radius = _radii(row, *np.mgrid[here][::-1])
+            at_rim = np.minimum(np.abs(radius - 1), np.abs(radius - ratio)) * row[3] < RIM_PX + path / 2
+            its = ((radius - 1) * row[3] - path / 2 < BEYOND * row[3]) & (radius < nearest[here])
+            rays[here][its] = np.where(at_rim, quality.rim, quality.disc)[its]
+            number[here][its], nearest[here][its] = circle_number(body, k), radius[its]
+    v, u = np.divmod(np.flatnonzero(rays), size[0])
+    return Pixels(u, v, rays[v, u], number[v, u])
+
+
+def scene_pixels(plain: Image, white: float, size: tuple[int, int], quality: FilmQuality) -> Pixels:
+    """Pixels in which a scene isn't what cells : (rows, columns) interpolated are, with more rays at outlines."""
+    contrast = bends(plain) / white
+    rays = np.select([contrast > CONTRAST, contrast > SHOWN], [np.int32(quality.rim), np.int32(quality.view)], np.int32(0))
+    rays = cv2.resize(rays, size, interpolation=cv2.INTER_NEAREST)
+    v, u = np.divmod(np.flatnonzero(rays), size[0])
+    return Pixels(u, v, rays[v, u], np.full(u.size, NO_CIRCLE))
+
+
+def shares(first: Cells, found: Light, near: Cells, light: Light) -> Arriving:
+    """By the near cells, and by the first ones beyond them : (h, w)."""
+    beyond = resized(Arriving.of(first, found).scene, near.chosen.shape[::-1])
+    fine = Arriving.of(near, light, beyond)
+    return Arriving(resized(fine.held, near.size), resized(fine.scene, near.size))
+
+
+def composed(fine: Cells, light: Light, share: Arriving, sharp: Pixels, its: Light, still: Image) -> Image:
+    """The frame : (h, w), from the light of cells and pixels and the scene's.
+
+    share : of (h, w)
+    """
+    cover = resized(fine.spread(light.held / fine.samples), fine.size)
+    plain = resized(fine.spread(light.held_plain), fine.size)
+    cover[sharp.v, sharp.u], plain[sharp.v, sharp.u] = its.held / sharp.samples, its.held_plain
+    return plain * share.held + (1 - cover) * still * share.scene
+
+
+def lines_of(bodies: Mapping[str, Held], device: CameraDevice, late: float) -> list[Array]:
+    """Thin parts of bodies in the image : (n, 2) px each."""
+    camera = device.optics.camera()
+    there = [(held.motion.later(late).world_from_target, held.line) for held in bodies.values() if held.present]
+    return [camera.project(rigid.apply(pose, line)) for pose, line in there if line is not None]
 
 
 def most_rays(quality: FilmQuality) -> int:
     """Points of the largest set."""
-    return max(TILE**2 * quality.view, quality.disc, quality.rim)
+    return max(TILE**2 * quality.view, quality.disc, quality.rim, quality.outline)
 
 
 def visible_shares(lanes: Lanes, light: Light, count: int) -> Array:
@@ -195,9 +218,10 @@ def visible_shares(lanes: Lanes, light: Light, count: int) -> Array:
     return seen / np.maximum(disc, 1)
 
 
-def arriving(radiance: Image, plain: Image) -> Image:
-    """Share : (h, w) of the unshadowed radiance that arrives, averaged over the cells about each."""
-    return over_a_tile(radiance) / np.maximum(over_a_tile(plain), np.float32(1e-20))
+def arriving(radiance: Image, plain: Image, otherwise: Image | float = 0.0) -> Image:
+    """Share : (h, w) of the unshadowed radiance that arrives, averaged over the cells about each; another where there is none."""
+    arrives, all_of_it = over_a_tile(radiance), over_a_tile(plain)
+    return np.float32(np.where(all_of_it > 1e-20, arrives / np.maximum(all_of_it, np.float32(1e-20)), otherwise))
 
 
 def over_a_tile(image: Image) -> Image:
@@ -205,6 +229,22 @@ def over_a_tile(image: Image) -> Image:
     box = np.full(TILE, 1 / TILE)
     kernel = np.float32(np.convolve(box, box))
     return cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT)
+
+
+def contrasts(image: Image) -> Image:
+    """Largest value less the smallest of each cell and its neighbours."""
+    return cv2.dilate(image, ABOUT) - cv2.erode(image, ABOUT)
+
+
+def bends(image: Image) -> Image:
+    """Second differences of each cell along both axes, the larger one: a step counts whole, a slope not at all."""
+    second = np.float32([[1, -2, 1]])
+    return np.maximum(*(np.abs(cv2.filter2D(image, -1, kernel)) for kernel in (second, second.T)))
+
+
+def resized(image: Image, size: tuple[int, int]) -> Image:
+    """An image of cells in another number of these."""
+    return cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
 
 
 def _radii(ellipse: Array, u: NDArray, v: NDArray) -> Array:

@@ -29,7 +29,7 @@ from twin.tracking.film_path import STILL, FilmPath, Way
 from twin.tracking.film_paths import insertion
 from twin.tracking.led_bodies import LedBodies
 from twin.tracking.mesh_bank import Bank, bank_of, build_bank, uncovered, uncovered_share
-from twin.tracking.rendered_views import Frames, Views, render_film, render_full, white_radiance
+from twin.tracking.rendered_views import Frames, Views, render_film, render_full, render_still, white_radiance
 from twin.tracking.samples import Held, Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
 from twin.tracking.study_samples import CLEAN
@@ -198,10 +198,11 @@ def shoot(
     bank: Bank, rig: Rig, made: Sequence[Take], quality: FilmQuality, seed: int, pixels: Literal["sketch", "full"] = "sketch"
 ) -> Iterator[Frames]:
     """Render the frames one after the other."""
+    still = render_still(bank, rig, made[0], quality, seed) if pixels == "sketch" else None
     for first in range(0, len(made), BATCH):
         some = made[first : first + BATCH]
-        if pixels == "sketch":
-            yield from render_film(bank, rig, some, quality, seed)
+        if still:
+            yield from render_film(bank, rig, some, quality, seed, still)
         else:
             yield from render_full(bank, rig, some, Quality(window=quality.rim), seed)
 

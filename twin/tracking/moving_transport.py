@@ -31,7 +31,7 @@ from twin.tracking.surface_prints import BitGrid, Face, grid_cover, poster_refle
 
 Floats = NDArray[np.float32]
 
-PIXELS = 8  # that a thread follows
+RAYS = 8  # that a thread follows, about
 SHADOWS = 2  # shadow rays a ray, a power of two
 UNDISTORTIONS = 8  # fixed-point steps; each leaves a tenth of the error, which starts at a few px
 LIFT_MM = 0.05  # of a shadow ray's start off the surface, more than the coordinates' rounding
@@ -65,6 +65,10 @@ class Light:
     seen: Floats  # of these, rays that reach it
     white: Floats  # rays that end on the paper of the target that has the lane's circle, or of the probe's
     white_radiance: Floats  # sum over these
+    held: Floats  # rays that meet a held body first
+    held_radiance: Floats  # mean over all rays, of what these receive
+    held_plain: Floats  # the same without shadows
+    unheld_radiance: Floats  # mean over all rays, of what the others receive if held bodies throw no shadow
 
     def part(self, lanes: slice) -> "Light":
         """Values of some lanes."""
@@ -84,6 +88,7 @@ def render(
     most_samples: int,
     seed: int,
     grid: BitGrid | None = None,
+    shadows: int = SHADOWS,
 ) -> Light:
     """Trace the lanes' rays.
 
@@ -94,6 +99,8 @@ def render(
         Points of the largest set, a power of two.
     grid : BitGrid or None
         Print on the face of the probe's target instead of the circles.
+    shadows : int
+        Shadow rays a ray, a power of two; of 0 all light arrives, at half the cost.
 
     Raises
     ------
@@ -103,17 +110,19 @@ def render(
     names = list(takes[0].held)
     if any(list(one.held) != names for one in takes):
         raise ValueError(f"takes: expected the bodies {', '.join(names)} in each, found others")
+    if not len(lanes.u):
+        return Light(*np.zeros((len(Light.__dataclass_fields__), 0), np.float32))
     first, step, end = _shares(lanes)
     take, camera = dr.gather(mi.UInt32, mi.UInt32(lanes.take), first), dr.gather(mi.UInt32, mi.UInt32(lanes.camera), first)
     rows = Rows.of(take_columns(takes, rig, bank.body_at, bank.scene_at), take)
     cameras = Rows.of(camera_columns(takes), take * 2 + camera)
     bodies = [_Body(k, name, rig.targets[name], rows, None if k else grid) for k, name in enumerate(names)]
-    path = _Path(bank, bodies, rows, cameras)
+    path = _Path(bank, bodies, rows, cameras, shadows)
     key = dr.gather(mi.UInt32, mi.UInt32([one.k for one in takes]), take) * 4 + camera
     seeds = mi.sample_tea_32(key, dr.opaque(mi.UInt32, seed), 4)[0]
     u, v, sets, circles = mi.Float(lanes.u), mi.Float(lanes.v), mi.UInt32(lanes.set), mi.UInt32(lanes.circle)
     firsts, counts = mi.UInt32(lanes.first), mi.UInt32(lanes.samples)
-    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(6)]
+    results = [dr.zeros(mi.Float, len(lanes.u)) for _ in range(10)]
 
     def body(pixel, k, *sums):
         """Ray k of a pixel; after the last one its sums are stored, and the next pixel's begin."""
@@ -122,9 +131,10 @@ def render(
             return dr.gather(type(column), column, pixel)
 
         points = PairedPoints(its(sets), its(firsts) + k, most_samples, seeds)
-        radiance, plain, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
+        radiance, plain, unheld, held, aims, reaches, on_paper = path.follow(its(u), its(v), its(circles), points)
         flags = (dr.select(one, 1.0, 0.0) for one in (aims, reaches, on_paper))
-        values = radiance, plain, *flags, dr.select(on_paper, radiance, 0.0)
+        of_held = (dr.select(held, one, 0.0) for one in (1.0, radiance, plain))
+        values = radiance, plain, *flags, dr.select(on_paper, radiance, 0.0), *of_held, dr.select(held, 0.0, unheld)
         sums = [total + value for total, value in zip(sums, values, strict=True)]
         done = k + 1 >= its(counts)
         for result, total in zip(results, sums, strict=True):
@@ -133,8 +143,9 @@ def render(
 
     state = (first, mi.UInt32(0), *(mi.Float(0) for _ in results))
     dr.while_loop(state, lambda pixel, *_: pixel < end, body, label="rays")
-    radiance, plain, *sums = (np.array(result) for result in results)
-    return Light(radiance / lanes.samples, plain / lanes.samples, *sums)
+    radiance, plain, *sums, held_radiance, held_plain, unheld = (np.array(result) for result in results)
+    means = (total / lanes.samples for total in (radiance, plain, held_radiance, held_plain, unheld))
+    return Light(next(means), next(means), *sums, *means)
 
 
 def _shares(lanes: Lanes) -> mi.Vector3u:
@@ -144,7 +155,7 @@ def _shares(lanes: Lanes) -> mi.Vector3u:
     """
     starts = np.flatnonzero(np.diff(lanes.take * 2 + lanes.camera, prepend=np.uint32(2**32 - 1)))
     ends = np.append(starts[1:], len(lanes.u))
-    steps = -(-(ends - starts) // PIXELS)
+    steps = -(-(ends - starts) // max(1, round(RAYS / float(lanes.samples.mean()))))
     first = np.concatenate([start + np.arange(step) for start, step in zip(starts, steps, strict=True)])
     table = mi.UInt32(np.uint32(np.column_stack([first, np.repeat(steps, steps), np.repeat(ends, steps)])).ravel())
     # fetched by number: what is read in order is compiled anew for each alignment in memory, which NumPy leaves to chance
@@ -240,8 +251,8 @@ class _Body:
 class _Path:
     """Rays through the same takes, one after another; fetches constant parameters once."""
 
-    def __init__(self, bank: Bank, bodies: Sequence[_Body], rows: Rows, cameras: Rows) -> None:
-        self.bank, self.bodies, self.rows = bank, bodies, rows
+    def __init__(self, bank: Bank, bodies: Sequence[_Body], rows: Rows, cameras: Rows, shadows: int) -> None:
+        self.bank, self.bodies, self.rows, self.shadows = bank, bodies, rows, shadows
         self.world_from_camera = Turn.of(cameras, "world_from_camera")
         self.fx, self.fy, self.cx, self.cy = cameras.all("pinhole")
         self.k1, self.k2, self.p1, self.p2, self.k3 = cameras.all("distortion")
@@ -255,23 +266,25 @@ class _Path:
         self.projector, self.projector_matrix = rows.all("projector"), rows.all("projector_matrix")
 
     def follow(self, u, v, circle, points: PairedPoints) -> tuple:
-        """Radiance of one ray, with shadows and without; whether it aims at the circle, reaches it, and ends on its paper."""
+        """Radiance of one ray, with shadows, without any, and without held bodies'; whether it meets a held body, and whether it
+        aims at the circle, reaches it, and ends on its paper.
+        """
         ray, cosine = self._ray(u, v, points)
         time = points.square().x - 0.5 + self.late  # not mirrored: a long blur wants as many times as there are rays
         turned = [body.ray(ray, time) for body in self.bodies]
         crossed = [body.on_face(its) for body, its in zip(self.bodies, turned, strict=True)]
-        place, normal, surface, on_faces, nothing = self._nearest(ray, turned, time, crossed)
-        light, plain = self._reflected(place, normal, -ray.d, surface, time, points)
+        place, normal, surface, on_faces, held, nothing = self._nearest(ray, turned, time, crossed)
+        lights = self._reflected(place, normal, -ray.d, surface, time, points)
         away = ((u - self.mid_u) ** 2 + (v - self.mid_v) ** 2) * self.corner
         falls = (1 - self.vignetting * away) * cosine**4
         around = self.ambient * self._share_from(ray.d)
-        radiance, plain = (dr.select(nothing, around, value) * falls for value in (light, plain))
+        radiances = (dr.select(nothing, around, value) * falls for value in lights)
         aims, reaches, on_paper = mi.Bool(False), mi.Bool(False), mi.Bool(False)
         for body, (x, y, faces), on_face in zip(self.bodies, crossed, on_faces, strict=True):
             towards = faces & body.within_circle(x, y, circle)
             aims, reaches = aims | towards, reaches | (towards & on_face)
             on_paper |= self._is_asked(body, circle) & on_face & body.is_paper(surface[0])
-        return radiance, plain, aims, reaches, on_paper
+        return *radiances, held, aims, reaches, on_paper
 
     def _is_asked(self, body: _Body, circle) -> mi.Bool:
         """Whether the lane's circle is one of the body's; a lane without a circle is the first body's."""
@@ -304,7 +317,8 @@ class _Path:
         return mi.Ray3f(mi.Point3f(self.scene_from_world.apply(mi.Vector3f(ray.o))), self.scene_from_world.rotate(ray.d))
 
     def _nearest(self, ray: mi.Ray3f, turned: Sequence[mi.Ray3f], time, crossed: Sequence[tuple]) -> tuple:
-        """Intersection of a ray: place and normal in the world, surface, of each body whether it is its target's face; or none.
+        """Intersection of a ray: place and normal in the world, surface, of each body whether it is its target's face, and
+        whether it is a held body at all; or none.
 
         turned, crossed : the ray in each target's frame, and where it crosses the face's plane.
         """
@@ -337,27 +351,31 @@ class _Path:
             self.bodies[0].target, reflectance, scene.uv.x, scene.uv.y, mi.UInt32(self.texture_shift.y * 100 + 1e6)
         )
         reflectance = dr.select(poster, sheet, reflectance)
-        return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_faces, nothing
+        return mi.Vector3f(ray(distance)), normal, (reflectance, row[4], row[5]), on_faces, held, nothing
 
     def _share_from(self, direction: mi.Vector3f) -> mi.Float:
         """Light that comes from a direction, over the mean of all."""
         return 1 + dr.dot(self.gradient, direction)
 
-    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> tuple[mi.Float, mi.Float]:
-        """Radiance towards the viewer: of all sources without shadows, if one of them is seen, mean of the shadow rays; and in
-        any case, the lamps' by their middles, which is what a ball that shines evenly gives a matte surface; of gloss on what is
-        curved it is sharper.
+    def _reflected(self, place, normal, view, surface, time, points: PairedPoints) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Radiance towards the viewer: of all sources without shadows, if one of them is seen, mean of the shadow rays; in any
+        case, the lamps' by their middles, which is what a ball that shines evenly gives a matte surface; of gloss on what is
+        curved it is sharper; and if one of them is seen past the scene.
         """
-        radiance = mi.Float(0)
-        for light in points.split(SHADOWS):
+        around, sources = self._sources(place, normal, view, surface, mi.Vector3f(0))
+        plain = around + sum(source.value for source in sources)
+        if not self.shadows:
+            return plain, plain, plain
+        radiance, unheld = mi.Float(0), mi.Float(0)
+        for light in points.split(self.shadows):
             ball = mi.Vector3f(mi.warp.square_to_uniform_sphere(light.square()))
             around, sources = self._sources(place, normal, view, surface, ball)
             total = around + sum(source.value for source in sources)
             way, weight = self._towards_one(around, sources, light.square().x * total, normal, light.square())
-            blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
+            by_scene, blocked = self._blocked(place + normal * LIFT_MM, way, time, total > 0)
             radiance += dr.select(blocked, 0, total * weight)
-        around, sources = self._sources(place, normal, view, surface, mi.Vector3f(0))
-        return radiance / SHADOWS, around + sum(source.value for source in sources)
+            unheld += dr.select(by_scene, 0, total * weight)
+        return radiance / self.shadows, plain, unheld / self.shadows
 
     def _sources(self, place, normal, view, surface, ball: mi.Vector3f) -> tuple[mi.Float, list["_Source"]]:
         """Unshadowed radiance from the surroundings' light, the lamps' points at `ball`, in radii, and the projector."""
@@ -416,15 +434,15 @@ class _Path:
         value = mean + modulation * dr.cos(2 * dr.pi * dr.select(along_rows > 0, v, u) / period)
         return dr.select(within, intensity * value, 0)
 
-    def _blocked(self, place, way, time, active) -> mi.Bool:
-        """Whether anything stands in a shadow ray's way."""
+    def _blocked(self, place, way, time, active) -> tuple[mi.Bool, mi.Bool]:
+        """Whether the scene stands in a shadow ray's way, and whether anything does."""
         reach = dr.norm(way)
         ray = mi.Ray3f(mi.Point3f(place), way / reach)
         in_scene = self._scene_ray(ray)
         in_scene.maxt = mi.Float(reach)
-        blocked = self.bank.scenes.ray_test(in_scene, active)
+        by_scene = blocked = self.bank.scenes.ray_test(in_scene, active)
         for body in self.bodies:
             in_body = body.banked(body.ray(ray, time))
             in_body.maxt = mi.Float(reach)
-            blocked |= self.bank.bodies.ray_test(in_body, active & body.present & ~blocked)
-        return blocked
+            blocked = blocked | self.bank.bodies.ray_test(in_body, active & body.present & ~blocked)
+        return by_scene, blocked

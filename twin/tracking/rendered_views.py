@@ -1,6 +1,6 @@
 """From a sample's parameters to camera images and their ground truth; several takes in one launch."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice, pairwise
@@ -13,9 +13,29 @@ from recon.geometry import rigid
 from recon.model import circle_layout
 from recon.model.rig import MOST_CIRCLES, PROBE, CameraDevice, Rig, Target
 from recon.threads import mapped
-from twin.sensor import Exposure, digitise, number_per_electron, read_out
+from twin.sensor import Exposure, digitise, number_per_electron, read_out, readout_by, sensed
 from twin.shooting import FilmQuality, Quality
-from twin.tracking.film_pictures import FilmPicture, film_picture, most_rays, visible_shares
+from twin.tracking.film_pictures import (
+    CONTRAST,
+    FINE_PX,
+    FIRST_PX,
+    SHADOWS,
+    Cells,
+    Pixels,
+    arriving,
+    bends,
+    composed,
+    contrasts,
+    fine_cells,
+    lines_of,
+    most_rays,
+    near_cells,
+    resized,
+    scene_pixels,
+    shares,
+    sharp_pixels,
+    visible_shares,
+)
 from twin.tracking.mesh_bank import Bank
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, Light, circle_number, render
 from twin.tracking.pixel_selection import HALF, PATCH, VIEW, Picture, Sketch, View, Window, full_frame, joined
@@ -24,9 +44,13 @@ from twin.tracking.surface_prints import BitGrid
 from twin.tracking.target_truth import ViewTruth, board_corners, inside_share, view_truth
 
 Grey = NDArray[np.uint8]
+Image = NDArray[np.float32]
 Views = tuple[ViewTruth, ViewTruth]
+Stills = tuple[Image, Image]  # (h, w) radiance by both cameras
 
 AROUND = 24  # px of a sketch's window about the targets' boards
+COARSE_PX = 4  # cells of a scene that a single frame shows
+STILL_K = 1 << 29  # number of what a film's takes have in common, beyond those of all takes
 DARKEST = 0.15  # of the light that falls on a face at right angles: what an exposure is set by is never less
 
 
@@ -102,32 +126,94 @@ def render_sketches(
     return _rendered(bank, rig, takes, pictures, quality, seed, grid)
 
 
-def render_film(bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQuality, seed: int) -> list[Frames]:
-    """Full camera images of which some pixels are rendered and the others interpolated; see `film_pictures`."""
-    targets = rig.targets
-    shots = shots_of(takes, targets)
-    pictures = [film_picture(shot.take, shot.device, shot.late, targets, shot.truth, quality) for shot in shots]
-    blocks = [picture.lanes(k // 2, shot.camera) for k, (picture, shot) in enumerate(zip(pictures, shots, strict=True))]
-    light = render(bank, rig, takes, joined(blocks), most_rays(quality), seed)
-    starts = np.cumsum([0, *(len(block.u) for block in blocks)])
-    parts = [light.part(slice(a, b)) for a, b in pairwise(starts)]
+def render_film(
+    bank: Bank, rig: Rig, takes: Sequence[Take], quality: FilmQuality, seed: int, still: Stills | None = None
+) -> list[Frames]:
+    """Full camera images of which some pixels are rendered and the others interpolated; see `film_pictures`.
 
-    def finished(shot: Shot, picture: FilmPicture, block: Lanes, part: Light) -> tuple[Grey, dict[str, ViewTruth]]:
-        shares, truth = visible_shares(block, part, len(shot.truth) * MOST_CIRCLES), {}
-        for number, (name, known) in enumerate(shot.truth.items()):
-            first = circle_number(number, 0)
-            visible = shares[first : first + len(known.ellipses)] * inside_share(known.ellipses, shot.device.optics.size)
-            its = block.circle // MOST_CIRCLES == number
-            white = _white(part, [its if number else its | (block.circle == NO_CIRCLE)], shot.take, shot.device, rig)
-            truth[name] = replace(known, visible=visible, white_dn=white)
-        return _exposed(picture.radiance(part), shot, rig), truth
+    still : the scene of all takes, as of `render_still`; without, each has its own, in cells of some pixels
+    """
+    shots, most = shots_of(takes, rig.targets), most_rays(quality)
+    scenes = list(still * len(takes)) if still else _coarse(bank, rig, shots, quality, seed)
+    whites = [white_radiance(shot.take, rig) for shot in shots]
+    lines = [lines_of(shot.take.held, shot.device, shot.late) for shot in shots]
 
-    both = list(mapped(finished, shots, pictures, blocks, parts))
+    def traced(selections: Iterable[Cells | Pixels], shadows: int = 0) -> list[Light]:
+        return _traced(bank, rig, shots, selections, most, seed, shadows)
+
+    first = [Cells.all_over(shot.device.optics.size, FIRST_PX, quality.view) for shot in shots]
+    found = traced(first, SHADOWS)
+    near = list(mapped(near_cells, first, found, scenes, whites, lines, [quality] * len(shots)))
+    light = traced(near, SHADOWS)
+    fine = list(mapped(fine_cells, near, light, lines, [quality] * len(shots)))
+    bodies = traced(fine)
+
+    def sharpened(shot: Shot, cells: Cells, its: Light, white: float, thin: Sequence[NDArray[np.float64]]) -> Pixels:
+        contrast = (bends(cells.spread(its.held_plain)) > CONTRAST * white) | (contrasts(cells.spread(its.held)) > 0)
+        targets = [rig.targets[name] for name in shot.truth]
+        return sharp_pixels(contrast, cells.size, thin, list(shot.truth.values()), targets, quality)
+
+    sharp = list(mapped(sharpened, shots, fine, bodies, whites, lines))
+    sharply = traced(sharp)
+
+    def finished(shot: Shot, number: int) -> tuple[Grey, dict[str, ViewTruth]]:
+        pixels, its, scene = sharp[number], sharply[number], scenes[number]
+        share = shares(first[number], found[number], near[number], light[number])
+        visible = visible_shares(pixels, its, len(shot.truth) * MOST_CIRCLES)
+        truth = {}
+        for body, (name, known) in enumerate(shot.truth.items()):
+            circles = slice(circle_number(body, 0), circle_number(body, len(known.ellipses)))
+            seen = visible[circles] * inside_share(known.ellipses, shot.device.optics.size)
+            own = (pixels.circle // MOST_CIRCLES == body) | ((pixels.circle == NO_CIRCLE) & (body == 0))
+            arrived = its.white_radiance * share.held[pixels.v, pixels.u]
+            white = _white(float(its.white[own].sum()), float(arrived[own].sum()), shot.take, shot.device, rig)
+            truth[name] = replace(known, visible=seen, white_dn=white)
+        return _exposed(composed(fine[number], bodies[number], share, pixels, its, scene), shot, rig), truth
+
+    both = list(mapped(finished, shots, range(len(shots))))
     result = []
-    for (first, known), (second, its) in zip(both[::2], both[1::2], strict=True):
-        truth, others = _paired(known, its)
-        result.append(Frames((first, second), truth, others=others))
+    for (first_view, known), (second_view, others) in zip(both[::2], both[1::2], strict=True):
+        truth, those = _paired(known, others)
+        result.append(Frames((first_view, second_view), truth, others=those))
     return result
+
+
+def render_still(bank: Bank, rig: Rig, take: Take, quality: FilmQuality, seed: int) -> Stills:
+    """The scene without bodies by both cameras : (h, w) radiance each, of each pixel, with more rays at outlines."""
+    shots, white, most = shots_of([_empty(take, STILL_K)], rig.targets), white_radiance(take, rig), most_rays(quality)
+    cells = [Cells.all_over(shot.device.optics.size, FINE_PX, quality.view) for shot in shots]
+    light = _traced(bank, rig, shots, cells, most, seed, SHADOWS)
+    plain = [one.spread(its.plain) for one, its in zip(cells, light, strict=True)]
+    share = [arriving(one.spread(its.radiance), its_plain) for one, its, its_plain in zip(cells, light, plain, strict=True)]
+    pixels = [scene_pixels(its_plain, white, one.size, quality) for one, its_plain in zip(cells, plain, strict=True)]
+    plain = [resized(its_plain, one.size) for one, its_plain in zip(cells, plain, strict=True)]
+    for image, some, its in zip(plain, pixels, _traced(bank, rig, shots, pixels, most, seed, 0), strict=True):
+        image[some.v, some.u] = its.plain
+    first, second = (image * resized(its, one.size) for image, its, one in zip(plain, share, cells, strict=True))
+    return first, second
+
+
+def _coarse(bank: Bank, rig: Rig, shots: Sequence[Shot], quality: FilmQuality, seed: int) -> list[Image]:
+    """The scene of each shot without bodies : (h, w) radiance."""
+    cells = [Cells.all_over(shot.device.optics.size, COARSE_PX, quality.view) for shot in shots]
+    empty = [shot._replace(take=_empty(shot.take, shot.take.k)) for shot in shots]
+    found = _traced(bank, rig, empty, cells, most_rays(quality), seed, SHADOWS)
+    plain = [(one, one.spread(light.plain), one.spread(light.radiance)) for one, light in zip(cells, found, strict=True)]
+    return [resized(its * arriving(radiance, its), one.size) for one, its, radiance in plain]
+
+
+def _empty(take: Take, k: int) -> Take:
+    """The take without its bodies, by the sample points of another."""
+    return replace(take, k=k, present=False, others={name: replace(held, present=False) for name, held in take.others.items()})
+
+
+def _traced(
+    bank: Bank, rig: Rig, shots: Sequence[Shot], selections: Iterable[Cells | Pixels], most: int, seed: int, shadows: int
+) -> list[Light]:
+    """Light of the pixels of each shot, in one launch; of takes one by one, as of several, for one kernel would be another."""
+    blocks = [one.lanes(number, shot.camera) for number, (one, shot) in enumerate(zip(selections, shots, strict=True))]
+    light = render(bank, rig, [shot.take for shot in shots], joined(blocks), most, seed, shadows=shadows)
+    return [light.part(slice(a, b)) for a, b in pairwise(np.cumsum([0, *(len(block.u) for block in blocks)]))]
 
 
 def _paired(first: Mapping[str, ViewTruth], second: Mapping[str, ViewTruth]) -> tuple[Views, dict[str, Views]]:
@@ -136,11 +222,13 @@ def _paired(first: Mapping[str, ViewTruth], second: Mapping[str, ViewTruth]) -> 
     return both.pop(PROBE), both
 
 
-def _exposed(radiance: NDArray[np.float32], shot: Shot, rig: Rig) -> Grey:
+def _exposed(radiance: Image, shot: Shot, rig: Rig) -> Grey:
     """Digital numbers of a whole image : (h, w)."""
-    electrons = radiance.ravel() * np.float32(_electrons(shot.take, shot.device, rig))
-    rng = np.random.default_rng([shot.take.noise_seed, shot.camera, 1])
-    return _read(electrons, slice(None), shot.device, shot.take, rng).reshape(radiance.shape)
+    sensor, exposure = shot.device.sensor, Exposure(1.0, shot.take.gain)
+    response, offset = (part.reshape(radiance.shape) for part in _unit_pattern(*radiance.shape, shot.device.serial))
+    pattern = 1 + np.float32(sensor.prnu) * response, np.float32(sensor.dsnu_e) * offset
+    readout = readout_by(sensor, exposure, _electrons(shot.take, shot.device, rig))
+    return sensed(radiance, pattern, readout, sensor, exposure, np.random.default_rng([shot.take.noise_seed, shot.camera, 1]))
 
 
 def _sketch(take: Take, device: CameraDevice, late: float, targets: Mapping[str, Target], quality: Quality) -> Sketch:
@@ -198,7 +286,12 @@ def _rendered(
                 known[name] = replace(
                     truth,
                     visible=_visible(light, its) * inside_share(truth.ellipses, device.optics.size),
-                    white_dn=_white(light, its, take, device, rig),
+                    white_dn=_white(
+                        *(sum(float(part[piece].sum()) for piece in its) for part in (light.white, light.white_radiance)),
+                        take,
+                        device,
+                        rig,
+                    ),
                     patch_origins=those,
                 )
             told.append(known)
@@ -248,7 +341,7 @@ def white_radiance(take: Take, rig: Rig) -> float:
     return float(take.face.paper / np.pi * ((intensity * cosine / distance2).sum() + around))
 
 
-def _read(electrons, pixel: NDArray[np.int64] | slice, device: CameraDevice, take: Take, rng: np.random.Generator) -> Grey:
+def _read(electrons, pixel: NDArray[np.int64], device: CameraDevice, take: Take, rng: np.random.Generator) -> Grey:
     """Digital numbers of pixels, counted row by row, from mean numbers of electrons."""
     sensor = device.sensor
     width, height = device.optics.size
@@ -271,10 +364,10 @@ def _visible(light: Light, pieces) -> NDArray[np.float64]:
     return np.array([light.seen[piece].sum() / max(light.disc[piece].sum(), 1) for piece in pieces], float)
 
 
-def _white(light: Light, pieces, take: Take, device: CameraDevice, rig: Rig) -> float:
-    """Brightness of the target's white about the circles, in digital numbers above black; NaN where none is seen."""
-    rays = sum(float(light.white[piece].sum()) for piece in pieces)
+def _white(rays: float, radiance: float, take: Take, device: CameraDevice, rig: Rig) -> float:
+    """Brightness of the target's white about the circles, in digital numbers above black, from the sum of the radiance of rays
+    that end there; NaN without any.
+    """
     if rays == 0:
         return float("nan")
-    mean = sum(float(light.white_radiance[piece].sum()) for piece in pieces) / rays
-    return mean * _electrons(take, device, rig) * number_per_electron(device.sensor, Exposure(1.0, take.gain))
+    return radiance / rays * _electrons(take, device, rig) * number_per_electron(device.sensor, Exposure(1.0, take.gain))

@@ -56,3 +56,37 @@ def test_the_forearm_is_closed_too(rng):
     skin = hand.skin(hand.lying(rng, True), 300)
     assert skin.is_watertight and skin.volume > 0
     assert np.linalg.norm(skin.vertices - hand.lying(rng, True).wrist, axis=1).max() > 250
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_a_hand_looked_at_closely_has_the_same_shape_in_finer_detail(rng, left):
+    """Closed; off the plain skin by creases, tendons and nails alone; reflecting within bounds, the same from the same seed."""
+    skeleton = hand.gripping(rng, ROD, left, 1.0)
+    plain = hand.skin(skeleton, 0, hand.CLOSE_MM)
+    (mesh, albedo), (_, again) = (hand.look(np.random.default_rng(3), skeleton, plain) for _ in range(2))
+    assert mesh.is_watertight and mesh.volume == pytest.approx(plain.volume, rel=0.03)
+    moved = np.linalg.norm(mesh.vertices - plain.vertices, axis=1)
+    assert 0.6 < moved.max() < 2.5 and np.median(moved) < 0.2
+    assert albedo.min() > 0.1 and albedo.max() < 0.8 and 0.05 < albedo.std() / albedo.mean() < 0.2
+    np.testing.assert_array_equal(albedo, again)
+
+
+def test_nails_are_paler_and_lie_on_the_back_of_the_fingers(rng):
+    """The palest patch of each digit's last bone lies outside of its bend, away from the rod that it closes around."""
+    skeleton = hand.gripping(rng, ROD, False, 1.0)
+    mesh, albedo = hand.look(rng, skeleton, hand.skin(skeleton, 0, hand.CLOSE_MM))
+    outside = []
+    for *_, last in skeleton.digits:
+        middle = last.end + 0.3 * (last.start - last.end)
+        near = np.linalg.norm(mesh.vertices - middle, axis=1) < 1.4 * max(last.radii)
+        palest = mesh.vertices[near][np.argsort(albedo[near])[-15:]].mean(axis=0)
+        outside.append(np.hypot(*palest[:2]) - np.hypot(*middle[:2]))
+    assert min(outside) > 1 and np.mean(outside) > 4
+
+
+def test_clothes_fit_a_hand_of_either_detail():
+    """The same kind of clothes from the same seed; only what is looked at closely has its own reflectance."""
+    skeleton = hand.lying(np.random.default_rng(1), False)
+    far, close = (hand.clothed(np.random.default_rng(5), skeleton, voxel) for voxel in (hand.VOXEL_MM, hand.CLOSE_MM))
+    assert [part.slot for part in far] == [part.slot for part in close]
+    assert far[0].albedo is None and close[0].albedo is not None and len(close[0].albedo) == len(close[0].mesh.vertices)

@@ -11,16 +11,15 @@ from recon.board_detection.discs import measure
 from recon.geometry import rigid
 from recon.geometry.ellipses import Ellipses
 from recon.model.circle_layout import circle_centres
-from recon.model.rig import PROBE
 from scenes.handheld.surroundings import surroundings
 from tests.twin.tracking.takes import facing, plain_take, ranges, rig
 from twin.optics.sampling import sobol_pair
 from twin.shooting import FilmQuality
 from twin.tracking import mesh_bank as bank_module
-from twin.tracking.film_pictures import TILE, film_picture, most_rays
+from twin.tracking import rendered_views
 from twin.tracking.mesh_bank import build_bank
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, _Path, render
-from twin.tracking.rendered_views import white_radiance
+from twin.tracking.rendered_views import render_film, white_radiance
 from twin.tracking.samples import draw
 from twin.tracking.target_truth import view_truth
 
@@ -154,7 +153,7 @@ def lit_by(take, *names: str):
     return replace(take, lighting=lighting)
 
 
-def test_paper_under_a_large_lamp_has_no_lattice_in_a_film(bank):
+def test_paper_under_a_large_lamp_has_no_lattice_in_a_film(bank, monkeypatch):
     """Nothing stands before the face, so brightness varies over paper as smoothly as the lamp's light."""
     take, truth = unhidden(bank)
     pose = take.motion.world_from_target
@@ -162,9 +161,8 @@ def test_paper_under_a_large_lamp_has_no_lattice_in_a_film(bank):
     lamps[:, 3] = 1
     lamps[0] = [*(pose[:3, 3] + pose[:3, :3] @ [100, 200, 700]), 80, 700.0**2]
     take = replace(take, lighting=replace(take.lighting, lamps=lamps, ambient=0.1))
-    quality = FilmQuality(view=MOST // TILE**2)
-    picture = film_picture(take, take.cameras[0], 0.0, RIG.targets, {PROBE: truth}, quality)
-    image = picture.radiance(render(bank, RIG, [take], picture.lanes(0, 0), most_rays(quality), 1))
+    monkeypatch.setattr(rendered_views, "_exposed", lambda radiance, *_: radiance)
+    image = render_film(bank, RIG, [take], FilmQuality(), 1)[0].views[0]
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     a, b = (truth.centres[k] - truth.centres[0] for k in (1, 2))
     along, across = np.linalg.solve(np.column_stack([a, b]), (np.stack([u, v], -1) - truth.centres[0])[..., None])[..., 0].T

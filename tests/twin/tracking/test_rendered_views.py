@@ -13,11 +13,13 @@ from recon.model.rig import PROBE
 from scenes.handheld import lofts
 from scenes.handheld.mesh_parts import Part
 from scenes.handheld.surroundings import Surroundings
-from tests.twin.tracking.takes import bare_board, facing, plain_take, rig_of_three
+from tests.twin.tracking.takes import bare_board, facing, plain_take, rig, rig_of_three
 from twin.shooting import FilmQuality, Quality
+from twin.tracking import rendered_views
 from twin.tracking.mesh_bank import bank_of
 from twin.tracking.moving_transport import NO_CIRCLE, Lanes, circle_number, render
-from twin.tracking.rendered_views import render_film, render_views
+from twin.tracking.pixel_selection import lanes_of
+from twin.tracking.rendered_views import render_film, render_still, render_views, white_radiance
 from twin.tracking.samples import Held, Motion, Take
 from twin.tracking.target_truth import board_corners, view_truth
 
@@ -186,3 +188,68 @@ def test_takes_of_different_bodies_are_refused(bank):
     take = both(facing(), BESIDE)
     with pytest.raises(ValueError, match="takes: expected the bodies probe, needle in each, found others"):
         render_film(bank, RIG, [take, replace(take, others={})], QUALITY, 1)
+
+
+def shaded() -> tuple:
+    """A bank and a take of a board that moves over a block on a bench, by 20 px and in a turn, in light of a large lamp."""
+    parts = (
+        Part("bench", lofts.box([6000, 6000, 40], [0, 0, -20]), False),
+        Part("phantom", lofts.box([120, 60, 50], [40, -30, 25]), False),
+    )
+    take = plain_take(facing(20.0, (-20.0, 10.0, 600.0)), shift_mm=(3.0, 1.5, 0.5), turn_rad=(0, 0.01, 0.02))
+    lamps = np.zeros((4, 5))
+    lamps[:, 3] = 1
+    lamps[0] = [150, -300, 100, 90, 600.0**2]
+    below = rigid.invert(rigid.from_rotation_vector([np.pi, 0, 0], [0, 0, 720]))
+    lighting = replace(take.lighting, lamps=lamps, ambient=0.3 / np.pi)
+    made = replace(take, body=0, surroundings=0, scene_from_world=below, lighting=lighting)
+    return bank_of([bare_board(rig().target)], [Surroundings(parts, ())]), made
+
+
+@pytest.mark.parametrize("of_a_film", [True, False])
+def test_a_frame_is_what_all_rays_would_make_of_it(of_a_film, monkeypatch):
+    """Blur and shadows against 64 rays in each fourth pixel, by both's scatter over seeds, and half a percent of white, which the
+    averages over shadows cost; but for the still block's outlines, where they cost up to 4 %.
+    """
+    monkeypatch.setattr(rendered_views, "_exposed", lambda radiance, *_: radiance)
+    bank, take = shaded()
+    own, white, quality = rig(), white_radiance(take, rig()), FilmQuality()
+    stills = [render_still(bank, own, take, quality, seed) if of_a_film else None for seed in range(4)]
+    frames = np.array([render_film(bank, own, [take], quality, seed, still)[0].views[0] for seed, still in enumerate(stills)])
+    v, u = np.mgrid[2:1024:4, 2:1280:4]
+    lanes = lanes_of(0, 0, u, v, 16, np.arange(u.size))
+    whole = np.array([render(bank, own, [take], lanes, 64, seed).radiance.reshape(u.shape) for seed in range(10, 14)]) / white
+    frames = frames[:, 2::4, 2::4] / white
+    apart, variance = frames.mean(axis=0) - whole.mean(axis=0), (frames.var(axis=0, ddof=1) + whole.var(axis=0, ddof=1)) / 4
+
+    def tiles(image):
+        return image.reshape(32, 8, 40, 8).sum(axis=(1, 3)) / 64
+
+    z = tiles(apart) / np.sqrt(tiles(variance) / 64 + 0.005**2)
+    assert abs(apart.mean()) < 0.002 and np.sqrt(np.mean(z**2)) < 1.3
+    assert np.abs(tiles(apart)).max() < 0.04
+    noise = np.sqrt(tiles(frames.var(axis=0, ddof=1)))
+    assert np.median(noise) < 0.01, "half of the sensor's at 65 DN"
+
+
+def test_beside_bodies_frames_are_the_still_scene(monkeypatch):
+    """To the last digit without bodies, and but for a shadow without a step beside one: no noise of its own, no seam."""
+    monkeypatch.setattr(rendered_views, "_exposed", lambda radiance, *_: radiance)
+    bank, take = shaded()
+    still = render_still(bank, rig(), take, FilmQuality(), 1)
+    empty, held = render_film(bank, rig(), [replace(take, present=False), replace(take, k=1)], FilmQuality(), 1, still)
+    for image, scene in zip(empty.views, still, strict=True):
+        np.testing.assert_array_equal(image, scene)
+    shade = held.views[0] / still[0]
+    assert shade[:, 1150:] == pytest.approx(1, abs=0.05) and np.median(np.abs(shade[:, 1150:] - 1)) < 0.002
+    assert np.abs(np.diff(shade[:200], axis=1)).max() < 0.02 and np.abs(np.diff(shade[:200], axis=0)).max() < 0.02
+
+
+def test_a_frame_depends_on_its_own_number_alone():
+    bank, take = shaded()
+    takes = [replace(take, k=k, noise_seed=k) for k in range(2)]
+    still = render_still(bank, rig(), take, FilmQuality(), 1)
+    once = render_film(bank, rig(), takes, FilmQuality(), 1, still)[1]
+    again = render_film(bank, rig(), takes[1:], FilmQuality(), 1, still)[0]
+    for one, other in zip(once.views, again.views, strict=True):
+        assert (one == other).all()
