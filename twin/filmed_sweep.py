@@ -18,7 +18,7 @@ from scenes.scene_types import Scene
 from twin import swept_bodies
 from twin.conditions import Conditions, in_use
 from twin.displacement import NOWHERE, Displacement
-from twin.living.living_body import Living, LivingSweep, living_body
+from twin.living.living_body import Living, LivingBody, LivingSweep, living_body
 from twin.shooting import FrameShooting
 from twin.swept_bodies import SweptBody
 from twin.tracking.led_bodies import LedBodies, check_names
@@ -178,13 +178,20 @@ class PlannedSweep:
         led = {PROBE: own}
         for name, one in self.bodies.items():
             led[name] = [one.way.motion(time * 1e-9, exposure_s) for time in target.times.tolist()]
+            if self.living is not None and not one.look.IN_A_HAND:
+                along = self.living.patient.world_from_body(target.times)
+                led[name] = [motion.carried(chest) for motion, chest in zip(led[name], along, strict=True)]
         led = {name: [motion.carried(moved) for motion in motions] for name, motions in led.items()}
         stage = scene_frames.SceneStage(self.scene, moved, led, {name: one.look for name, one in self.bodies.items()})
         bank = scene_frames.make_bank(stage, rig, settings.seed)
         made = scene_frames.takes(stage, bank, rig, ranges, settings.frames, settings.own_seed, settings.conditions.motion)
 
         def frames() -> Iterable["Frames"]:
-            return shown(film_session.shoot(bank, rig, made, settings.frames.quality, settings.own_seed), len(made))
+            quality, living = settings.frames.quality, self.living
+            if living is None:
+                return shown(film_session.shoot(bank, rig, made, quality, settings.own_seed), len(made))
+            moments = (scene_frames.parts_of(living.scene_at(self.scene, time)) for time in target.times.tolist())
+            return shown(film_session.shoot_moving(bank, rig, made, quality, settings.own_seed, moments), len(made))
 
         return scene_frames.SceneFilm(rig, settings.rig, settings.frames, self.plan.track.times, made, frames, stage.looks)
 
@@ -224,6 +231,8 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
         settings.conditions.motion,
         settings.filmed,
     )
+    if living is not None:
+        bodies = {name: _beside(one, living) for name, one in bodies.items()}
     moved = settings.moved.matrix(scene)
     plan = replace(plan, track=_carried(plan.track, moved))
     bodies = {
@@ -231,6 +240,14 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     }
     swept = None if living is None else LivingSweep(living, settings.ultrasound, plan.target.path)
     return PlannedSweep(settings, scene, scanned, plan, bodies, moved, swept)
+
+
+def _beside(one: SweptBody, living: LivingBody) -> SweptBody:
+    """A body beside a patient who lives: what stands goes along with her chest, under what a hand holds she moves."""
+    if one.look.IN_A_HAND:
+        return replace(one, scanned=_carried(one.scanned, np.linalg.inv(living.world_from_body(one.scanned.times))))
+    chest = living.world_from_body(one.truth.times)
+    return replace(one, track=_carried(one.track, chest), truth=_carried(one.truth, chest))
 
 
 def _carried(track: Track, world_from_reference: Array) -> Track:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.geometry import rigid
+from recon.model import tracks
 from recon.model.rig import Fraction, Part, Positive, Vector
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
@@ -159,6 +160,12 @@ class LivingSweep:
         face, normal = _foot(self.transducer, body_from_image)
         return elastic_body.press(self.patient.soft, face, normal, self.patient.beaten(time), self._drag_at(time, normal))
 
+    def scene_at(self, scene: Scene, time: int) -> Scene:
+        """The scene at a moment, ns, as cameras see it under the probe."""
+        moment = np.array([time], np.int64)
+        poses, carried = self.body_from_image(moment, tracks.at(self.path, moment)), self.patient.world_from_body(moment)
+        return moved_scene(scene, self.patient, carried[0], self.field(time, poses[0]))
+
     def truth(self, times: Moments, world_from_image: Array) -> dict[str, Array]:
         """Truth of some images : where the chest stood, and where points of the body and middles of masses were and rest.
 
@@ -178,8 +185,7 @@ class LivingSweep:
         for time, pose, carried in zip(times.tolist(), poses, motion, strict=True):
             field = self.field(time, pose)
             rested.append(np.float32(rested_at(field, rigid.apply(pose, pixels))))
-            moved = [trimesh.Trimesh(moved_to(field, mesh.vertices), mesh.faces, process=False) for mesh in hidden]
-            centres.append([rigid.apply(carried, mesh.center_mass) for mesh in moved])
+            centres.append([moved_mesh(mesh, carried, field).center_mass for mesh in hidden])
         resting = np.array([mesh.center_mass for mesh in hidden]).reshape(-1, 3)
         shapes = np.array(centres).reshape(len(times), len(hidden), 3)
         return {"world_from_body": motion, "rested_mm": np.array(rested), "centres_mm": shapes, "resting_centres_mm": resting}
@@ -220,17 +226,19 @@ def living_body(living: Living, body: Body, surface: str, seed: int) -> LivingBo
 
 
 def scenes_at(scene: Scene, patient: LivingBody, times: Moments) -> list[Scene]:
-    """A scene at moments : (n,) ns, with no probe on it: all but a hard support goes along with the chest."""
+    """A scene at moments : (n,) ns, with no probe on it."""
+    places = zip(times.tolist(), patient.world_from_body(times), strict=True)
+    return [moved_scene(scene, patient, carried, patient.field(time)) for time, carried in places]
+
+
+def moved_scene(scene: Scene, patient: LivingBody, world_from_body: Array, field: Displacement) -> Scene:
+    """A scene of which all but a hard support goes along with the chest, and yields."""
     stays = {solid.name for solid in patient.body.solids if solid.name in SUPPORTS and not solid.tissue.soft}
-    found = []
-    for time, carried in zip(times.tolist(), patient.world_from_body(times), strict=True):
-        field = patient.field(time)
-        things = [
-            one if one.name in stays else replace(one, mesh=moved_mesh(one.mesh, carried, field), primitive=None)
-            for one in scene.things
-        ]
-        found.append(replace(scene, things=tuple(things), shapes=()))
-    return found
+    things = [
+        one if one.name in stays else replace(one, mesh=moved_mesh(one.mesh, world_from_body, field), primitive=None)
+        for one in scene.things
+    ]
+    return replace(scene, things=tuple(things), shapes=())
 
 
 def moved_mesh(mesh: trimesh.Trimesh, world_from_body: Array, field: Displacement) -> trimesh.Trimesh:

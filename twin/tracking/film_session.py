@@ -20,6 +20,7 @@ from recon.model.circle_layout import circle_centres
 from recon.model.rig import PROBE, Positive, Rig, Target
 from scenes.handheld.body_look import Stand
 from scenes.handheld.handheld_assembly import held
+from scenes.handheld.mesh_parts import Part
 from scenes.handheld.surroundings import surroundings
 from scenes.scene_types import Scene
 from twin import conditions
@@ -28,7 +29,7 @@ from twin.shooting import FilmQuality, Quality, Shooting
 from twin.tracking.film_path import STILL, FilmPath, Way
 from twin.tracking.film_paths import insertion
 from twin.tracking.led_bodies import LedBodies
-from twin.tracking.mesh_bank import Bank, bank_of, build_bank, uncovered, uncovered_share
+from twin.tracking.mesh_bank import Bank, bank_of, build_bank, reshape_scene, uncovered, uncovered_share
 from twin.tracking.rendered_views import Frames, Views, render_film, render_full, render_still, white_radiance
 from twin.tracking.samples import Held, Motion, Take, draw
 from twin.tracking.sampling_ranges import DataRanges
@@ -192,6 +193,15 @@ def in_a_row(
     return [
         replace(take, white_dn=shooting.white_dn * part) for take, part in zip(made, (falls / falls.mean()).tolist(), strict=True)
     ]
+
+
+def shoot_moving(
+    bank: Bank, rig: Rig, made: Sequence[Take], quality: FilmQuality, seed: int, moments: Iterable[Sequence[Part]]
+) -> Iterator[Frames]:
+    """Render the frames one after the other, of surroundings whose parts move: as they are in each."""
+    for take, parts in zip(made, moments, strict=True):
+        reshape_scene(bank, parts)
+        yield from render_film(bank, rig, [take], quality, seed, render_still(bank, rig, take, quality, seed))
 
 
 def shoot(

@@ -81,6 +81,14 @@ def bank_of(bodies: Sequence[Sequence[Part]], around: Sequence[Surroundings]) ->
     return Bank(loaded, scenes, mi.ShapePtr(posters), body_at, scene_at)
 
 
+def reshape_scene(bank: Bank, parts: Sequence[Part]) -> None:
+    """Give the one surroundings of a bank the form that its parts have at another moment."""
+    found, parameters = merged(parts), mi.traverse(bank.scenes)
+    parameters["a.vertex_positions"] = np.float32(found.vertices + bank.scene_at[0]).ravel()
+    parameters["a.vertex_normals"] = np.float32(found.normals).ravel()
+    parameters.update()
+
+
 def uncovered(bank: Bank, body: int, target: Target, eyes: Array) -> float:
     """Share of the circles' rims that eyes : (n, 3) mm in the target's frame see past a body."""
     rims = outline(circle_centres(target) + np.array([0, 0, LIFT_MM]), target.outer_diameter_mm / 2).reshape(-1, 3)
