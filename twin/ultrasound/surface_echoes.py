@@ -322,7 +322,8 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
             value *= _unaliased(2 * order * scanner.wavenumber * slope_x * line_mm)
             value *= _unaliased(2 * order * scanner.wavenumber * slope_z * ACROSS_MM)
             if order == 1 and mirror < 1:
-                phase = _phase_of_patch(ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth, scanner.seed)
+                at = resting_place(solids, ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth)
+                phase = _phase_of_patch(at[0], at[1], at[2], scanner.seed)
                 value += _scatter(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
             if value != 0:
                 echo = np.complex64(strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]

@@ -105,6 +105,7 @@ def neo_hookean(skin):
     return nodes, np.stack([u[basis.nodal_dofs[k]] for k in range(3)], axis=1)
 
 
+@pytest.mark.slow
 def test_displacements_are_those_of_a_neo_hookean_body_with_the_same_skin(pressed):
     nodes, expected = neo_hookean(pressed)
     inner = (nodes[:, 2] > TOP + 1) & (nodes[:, 2] < TOP + SIZE[2] - 1)
