@@ -15,6 +15,9 @@ With `living=patient` she breathes, her heart beats, and soft tissue yields to t
 expiration, is that of the fringes. OUT/truth then also holds living.npz: where chest and masses were at each image, and where
 the points that its pixels show rest.
 
+With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds `seed`, `seed`+1 and so on, each of another
+patient. A run that was stopped goes on where it was; any engine gives the same bytes.
+
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
 B-scans that they are led to. Poses are found where both cameras have the body's target in view: a line for each body says in how
 many, and warns of none.
@@ -24,6 +27,7 @@ many, and warns of none.
     sonotwin sweep filmed=true clocks.camera_hz=20 out=outputs/filmed
     sonotwin sweep scene=patient ultrasound=clinic out=outputs/patient
     sonotwin sweep scene=patient ultrasound=clinic living=patient path.standoff_mm=-2 out=outputs/pressed
+    sonotwin sweep scene=patient ultrasound=clinic living=patient path.standoff_mm=-2 count=100 engine=dask out=outputs/patients
     sonotwin sweep scene=tank ultrasound=water path=bob out=outputs/bottom
     sonotwin sweep scene=crosswire ultrasound=water path=wire out=outputs/wires
     sonotwin sweep scene=n_wires ultrasound=water path=rows out=outputs/rows
@@ -35,14 +39,17 @@ many, and warns of none.
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+from pydantic import Field, model_validator
 from rich.console import Console
 from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SCANNER, sweep_part
 from recon.model.rig import PROBE
 from sonotwin.console_watch import ConsoleWatch, LineConsole
+from twin import sweep_data
+from twin.engine import Engine
 from twin.filmed_sweep import PlannedSweep, SweepSettings, plan_sweep
 from twin.session import Session
 from twin.ultrasound import sweep_session
@@ -60,6 +67,18 @@ class Config(SweepSettings):
 
     out: Path
     add: bool = False
+    count: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    engine: Engine = Engine()
+
+    @model_validator(mode="after")
+    def _many_of_one_kind(self) -> "Config":
+        if self.count > 1 and (self.filmed or self.add):
+            raise ValueError(f"count: expected 1 with {'filmed' if self.filmed else 'add'}=true, found {self.count}")
+        return self
+
+    def settings(self) -> SweepSettings:
+        """Settings that the bytes depend on."""
+        return SweepSettings(**{name: getattr(self, name) for name in SweepSettings.model_fields})
 
 
 def run(config: Config) -> None:
@@ -71,7 +90,10 @@ def run(config: Config) -> None:
         If the scene has no acoustics or not what the path is about, or `out` can't be written to.
     """
     console = LineConsole()
-    settings = config.model_dump(mode="json", exclude={"out", "add"})
+    if config.count > 1:
+        render_many(config, console)
+        return
+    settings = config.settings().model_dump(mode="json")
     devices = (SCANNER, *(CAMERAS if config.filmed else ()))
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
@@ -106,6 +128,21 @@ def run(config: Config) -> None:
     filmed = f", {moments} pairs of frames" if film else ""
     console.print(f"render      {count} B-scans, {width}x{height}{filmed}, {seconds:.1f} s")
     console.print(f"wrote       {config.out}/{{capture,truth}}", markup=False)
+
+
+def render_many(config: Config, console: Console) -> None:
+    """Render the sweeps that aren't there yet, each into a folder of its own."""
+    settings, start = config.settings(), perf_counter()
+    numbers = sweep_data.missing(config.out, settings, config.count)
+    if len(numbers) < config.count:
+        console.print(f"found       {config.count - len(numbers)} sweeps")
+    total = 0
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        made = sweep_data.make(config.out, settings, numbers, config.engine)
+        for images in progress.track(made, total=len(numbers), description="rendering sweeps"):
+            total += images
+    console.print(f"render      {len(numbers)} sweeps, {total} B-scans, {perf_counter() - start:.1f} s")
+    console.print(f"wrote       {config.out}/000000 to {config.count - 1:06d}/{{capture,truth}}", markup=False)
 
 
 def filming(planned: PlannedSweep, console: Console) -> "SceneFilm":

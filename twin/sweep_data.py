@@ -1,0 +1,68 @@
+"""Data sets of sweeps: each of its own patient and hand, in a folder of its own, whatever the engine and its workers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from recon.capture.manifest import SCANNER, sweep_part
+from scenes.catalogue import parse_scene
+from twin.engine import Engine, results
+from twin.filmed_sweep import SweepSettings, plan_sweep
+from twin.session import SETTINGS, Session, read_json
+from twin.ultrasound import sweep_session
+
+
+def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
+    """Numbers of the sweeps that aren't there yet.
+
+    Raises
+    ------
+    InputError
+        If something else is in the place of one.
+    """
+    found = []
+    for number in range(count):
+        one = _session(out, settings, number)
+        path = one.truth.folder / SETTINGS
+        if not path.is_file() or read_json(path) != one.settings:
+            one.check()
+            found.append(number)
+    return found
+
+
+def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Iterator[int]:
+    """Render sweeps; gives the B-scans of each as it is done."""
+    return results(engine, write, ((out, settings, number) for number in numbers))
+
+
+def write(out: Path, settings: SweepSettings, number: int) -> int:
+    """Render the sweep of a number, and write it with its truth; gives its B-scans."""
+    planned = plan_sweep(numbered(settings, number))
+    chosen = planned.settings
+    known = sweep_session.PURPOSES[chosen.path.kind] != "probe"
+    sweep_session.write_session(
+        _session(out, settings, number),
+        planned.scene,
+        planned.scanned,
+        chosen.ultrasound,
+        planned.plan,
+        planned.scans(),
+        sweep_session.calibration_of(chosen.rig, chosen.ultrasound) if known else None,
+        None,
+        planned.bodies,
+        planned.truth if planned.living else None,
+    )
+    return len(planned.plan.times)
+
+
+def numbered(settings: SweepSettings, number: int) -> SweepSettings:
+    """The settings of a sweep: of another seed, and of another patient where a scene is drawn by a seed."""
+    scene = settings.scene
+    if "seed" in type(parse_scene(scene)[1]).model_fields:
+        scene = scene | {"seed": parse_scene(scene)[1].seed + number}
+    return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
+
+
+def _session(out: Path, settings: SweepSettings, number: int) -> Session:
+    chosen = numbered(settings, number)
+    name = f"{number:06d}"
+    return Session(out / name, sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,))
