@@ -44,6 +44,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "chain": "twin.experiments.chain_trial",
     "tank": "twin.experiments.tank_trial",
     "breast": "twin.experiments.breast_trial",
+    "patient": "twin.experiments.patient_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made

@@ -99,6 +99,7 @@ class LivingBody:
     body: Body  # at rest
     surface: Solid  # the skin that faces the cameras
     phases: tuple[float, float]  # of breath and heart at the session's start
+    element_mm: float = elastic_body.ELEMENT_MM
 
     def world_from_body(self, times: Moments, share: float = 1.0) -> Array:
         """Rigid motion of the chest, or a share of it : (n, 4, 4), at moments : (n,) ns."""
@@ -119,7 +120,7 @@ class LivingBody:
     def soft(self) -> ElasticBody:
         """The body's elasticity; takes seconds."""
         support = next((one for one in self.body.solids if one.name in SUPPORTS), None)
-        return elastic_body.elastic_body(self.body, self.surface, support)
+        return elastic_body.elastic_body(self.body, self.surface, support, self.element_mm)
 
     @cached_property
     def _beat(self) -> Array:
