@@ -20,11 +20,12 @@ from recon.threads import in_threads
 from twin.ultrasound.beam import receive_aperture
 from twin.ultrasound.echo_solids import Body, between, is_sheet
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
-from twin.ultrasound.sound_paths import Paths, normal_at, reflection, squareness
+from twin.ultrasound.sound_paths import Paths, normal_at, reflection, squareness, without_contact
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
+NOTHING = -50.0  # nepers, of a ray that begins in air
 STRIDE = 4  # levels from one average to the next: between them, it hardly changes
 
 
@@ -45,6 +46,7 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
     tissues = body.acoustics(transducer.frequency_mhz)
     delays = paths.step_mm * (transducer.assumed_speed / tissues.speed - 1)
     in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, poses, tangents, lines.pitch_mm)
+    along[0, :, without_contact(paths, transducer)] = NOTHING
     half = receive_aperture(transducer, depths) / 2
     out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(4)))
     in_threads(_gather, count, out, along, tangents, half, lines.pitch_mm, transducer.wavenumber, transducer.refraction)

@@ -68,7 +68,18 @@ def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths
     steps = _Steps(sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
     solids = body.packed()
     in_threads(_follow, size[0], paths, solids, tissues, steps, poses)
+    lost = without_contact(paths, transducer)
+    if lost.any():
+        paths.amplitude[lost] = 0
     return paths
+
+
+def without_contact(paths: Paths, transducer: Transducer) -> NDArray[np.bool_]:
+    """Lines : (w,) whose skin lies beyond the gel."""
+    if transducer.gel_mm is None:
+        return np.zeros(len(paths.labels), bool)
+    reach = int(transducer.gel_mm / paths.step_mm) + 1
+    return ~(paths.labels[:, :reach] > 0).any(axis=1)
 
 
 @njit(inline="always")

@@ -44,6 +44,8 @@ class Transducer(Part):
     aperture_rays: Annotated[int, Field(ge=1, le=31)] = (
         1  # over which paths are averaged; 1 is the middle one; see `aperture_paths`
     )
+    gel_mm: Positive | None = None
+    """mm of gel between face and skin, at most: lines that begin farther off have air before them, and no echo; null is any"""
     scatterers_per_mm3: Annotated[float, Field(ge=1, le=1000)] = 64.0
     tgc_db_per_cm_mhz: NotNegative = 0.5  # attenuation that the gain makes up for
     tgc_limit_db: NotNegative = 55.0  # most gain over depth

@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from recon.geometry import rigid
 from scenes.catalogue import build_scene
+from scenes.scene_types import Material, Scene, Thing
 from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down
+from twin.ultrasound.aperture_paths import over_aperture
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.sound_paths import follow, reflection
 
@@ -45,3 +48,19 @@ def test_lines_are_followed_as_by_the_slow_way(small, kind):
     assert quick.shown_mm == pytest.approx(slow.shown_mm, abs=1e-4)
     assert quick.amplitude == pytest.approx(slow.amplitude, abs=1e-4)
     assert quick.shift_mm == pytest.approx(slow.shift_mm, abs=1e-3)
+
+
+def test_lines_beyond_the_gel_have_air_before_them(clean):
+    """A block under half of the array, 0.5 mm below it: with 1 mm of gel the other half gets no echo, nor gives an aperture any."""
+    block = trimesh.creation.box((20.0, 40.0, 30.0))
+    block.apply_translation((-10.0, 0.0, 615.5))
+    there = body(Scene("breast", (Thing("breast", block, Material(0.4)),)))
+    pose, half = down(clean, (0.0, 0.0, 600.0)), clean.image_size[0] // 2
+    wet, dry = (follow(there, clean.model_copy(update={"gel_mm": gel}), pose) for gel in (None, 1.0))
+    assert (wet.amplitude[half + 5 :, 50] > 0).all()
+    assert (dry.amplitude[half + 5 :, 50] == 0).all()
+    np.testing.assert_array_equal(dry.amplitude[: half - 5], wet.amplitude[: half - 5])
+    several = clean.model_copy(update={"gel_mm": 1.0, "aperture_rays": 7})
+    averaged = over_aperture(follow(there, several, pose), there, several, pose).amplitude[:, 200]
+    assert averaged[half + 100] < 1e-12
+    assert 0.3 < averaged[half] < 0.9
