@@ -51,7 +51,7 @@ def test_lines_are_followed_as_by_the_slow_way(small, kind):
 
 
 def test_lines_beyond_the_gel_have_air_before_them(clean):
-    """A block under half of the array, 0.5 mm below it: with 1 mm of gel the other half gets no echo, nor gives an aperture any."""
+    """A block under half of the array, 0.5 mm below it: the other half gets no echo, nor gives an aperture any."""
     block = trimesh.creation.box((20.0, 40.0, 30.0))
     block.apply_translation((-10.0, 0.0, 615.5))
     there = body(Scene("breast", (Thing("breast", block, Material(0.4)),)))
@@ -60,7 +60,10 @@ def test_lines_beyond_the_gel_have_air_before_them(clean):
     assert (wet.amplitude[half + 5 :, 50] > 0).all()
     assert (dry.amplitude[half + 5 :, 50] == 0).all()
     np.testing.assert_array_equal(dry.amplitude[: half - 5], wet.amplitude[: half - 5])
-    several = clean.model_copy(update={"gel_mm": 1.0, "aperture_rays": 7})
-    averaged = over_aperture(follow(there, several, pose), there, several, pose).amplitude[:, 200]
-    assert averaged[half + 100] < 1e-12
-    assert 0.3 < averaged[half] < 0.9
+    several = clean.model_copy(update={"aperture_rays": 7})
+    whole, cut = (
+        over_aperture(follow(there, array, pose), there, array, pose).amplitude[:, 200]
+        for array in (several, several.model_copy(update={"gel_mm": 1.0}))
+    )
+    assert cut[half + 100] < 1e-12
+    assert 0.15 < cut[half - 2] / whole[half - 2] < 0.5  # half of the aperture is left, the one whose way is through tissue

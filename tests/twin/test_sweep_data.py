@@ -1,0 +1,56 @@
+"""Many sweeps: each of its own patient and hand, resumed, and of the same bytes on any engine."""
+
+import hashlib
+
+import pytest
+
+from recon.errors import InputError
+from twin import sweep_data
+from twin.engine import Engine
+from twin.filmed_sweep import SweepSettings
+from twin.ultrasound.probe_path import Hold
+from twin.ultrasound.transducer import Transducer
+
+
+@pytest.fixture
+def settings(rig):
+    return SweepSettings(rig=rig, scene={"kind": "breast"}, ultrasound=Transducer(), path=Hold(seconds=0.1), seed=4)
+
+
+def digest(folder):
+    found = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            found.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return found.hexdigest()
+
+
+def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
+    later = sweep_data.numbered(settings, 3)
+    assert (later.seed, later.scene["seed"]) == (7, 10)
+    assert later.path == settings.path
+    cut = sweep_data.numbered(settings.model_copy(update={"scene": {"kind": "sphere"}}), 3)
+    assert cut.scene == {"kind": "sphere"}
+
+
+def test_sweeps_that_are_there_are_kept(settings, tmp_path):
+    assert sweep_data.missing(tmp_path, settings, 2) == [0, 1]
+    assert list(sweep_data.make(tmp_path, settings, [0], Engine())) == [3]
+    assert sweep_data.missing(tmp_path, settings, 2) == [1]
+    other = settings.model_copy(update={"seed": 5})
+    assert sweep_data.missing(tmp_path, other, 1) == [0]
+
+
+def test_foreign_files_are_not_replaced(settings, tmp_path):
+    mine = tmp_path / "000001" / "capture"
+    mine.mkdir(parents=True)
+    (mine / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        sweep_data.missing(tmp_path, settings, 2)
+
+
+@pytest.mark.slow
+def test_engines_give_the_same_bytes(settings, tmp_path):
+    for name, engine in (("one", Engine()), ("two", Engine(workers=2)), ("dask", Engine(name="dask", workers=2))):
+        assert sorted(sweep_data.make(tmp_path / name, settings, [0, 1], engine)) == [3, 3]
+    assert digest(tmp_path / "one") == digest(tmp_path / "two") == digest(tmp_path / "dask")
