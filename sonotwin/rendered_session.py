@@ -101,7 +101,7 @@ def parts(chosen: Settings, out: Path, bottom_hz: float = inf) -> Iterator[Rende
     bottom = {"scene": choices.read("scene", "tank"), "ultrasound": _in_water(chosen), "path": bob}
     slower = clocks.model_copy(update={"camera_hz": min(clocks.camera_hz, bottom_hz)})
     yield _swept(chosen, out, BOTTOM, "render a flat bottom, up and down", bottom, slower)
-    scan = {"scene": chosen.scene, "ultrasound": chosen.ultrasound, "path": chosen.path}
+    scan = {name: getattr(chosen, name) for name in ("scene", "ultrasound", "path", "living")}
     yield _swept(chosen, out, SCAN, "render a sweep over the scene: B-scans, frames, and their truth", scan, clocks)
 
 
@@ -123,7 +123,7 @@ def board(chosen: Settings, out: Path, add: bool = True) -> render.Config:
 
 def skin(chosen: Settings, out: Path) -> render.Config:
     """Settings of the scene under fringes."""
-    own = {name: getattr(chosen, name) for name in ("scene", "patterns", "cameras", "shooting")}
+    own = {name: getattr(chosen, name) for name in ("scene", "patterns", "cameras", "shooting", "living")}
     return render.Config.model_validate(_shared(chosen) | own | {"out": out, "add": True})
 
 
