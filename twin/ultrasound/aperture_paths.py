@@ -66,8 +66,10 @@ def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
         sums = np.concatenate([np.zeros_like(table[:1], float), np.cumsum(table, axis=0, dtype=float)])
         return (sums[end, level] - sums[first, level]) / (end - first)
 
-    shift, focus = mean(mean(paths.shift_mm)), mean(paths.focus)
-    thinned = np.clip(np.abs(1 - np.gradient(shift, pitch_mm, axis=0)), 0.05, 4.0)  # lines a line's width of tissue
+    focus = mean(paths.focus)
+    seen = np.sort(pitch_mm * line - mean(paths.shift_mm), axis=0)  # lines never cross, or one would gather the power of three
+    shift = mean(pitch_mm * line - seen)
+    thinned = np.clip(1 - np.gradient(shift, pitch_mm, axis=0), 0.05, 4.0)
     amplitude = paths.amplitude * np.sqrt(thinned)
     return Paths(paths.step_mm, paths.labels, paths.shown_mm, *(part.astype(np.float32) for part in (amplitude, shift, focus)))
 
