@@ -131,7 +131,7 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
         Layer("rib", _ribs(anatomy, grid, muscle), mirrors=True),
         Layer("lung", _cut(muscle + anatomy.muscle_mm + 11), mirrors=True),
     ]
-    coarse, strands = noise(7), _along(strata, grid, noise((9, 9, 1.5)))  # of fat, and of gland and muscle: fibres that lie about level
+    coarse, strands = noise(7), _along(strata, grid, noise((9, 9, 1.5)))  # of fat, and of gland and muscle: bundles along strata
     streaky = (muscle < 0) | (gland < 0)
     spread_db = anatomy.uneven_db * np.where(streaky, 2.0, 1.0)
     uneven = spread_db * np.where(streaky, (2 * strands + coarse) / np.sqrt(5), (strands + coarse) / np.sqrt(2))

@@ -45,7 +45,8 @@ def packed(layers: Layers | None) -> Grown:
     distance = np.stack([one.distance for one in layers.layers], axis=-1)
     half = np.array([one.half_mm for one in layers.layers], np.float32)
     uneven = np.exp(layers.uneven_db * np.float32(np.log(10) / 20))
-    return Grown(distance, _sure(layers.layers), half, np.asarray(layers.origin, float), 1 / layers.step_mm, uneven, layers.strata_mm, _strands())
+    place = np.asarray(layers.origin, float), 1 / layers.step_mm
+    return Grown(distance, _sure(layers.layers), half, *place, uneven, layers.strata_mm, _strands())
 
 
 @cache

@@ -1,8 +1,8 @@
 """What a scanner makes of echoes before it shows them: compounding, gain as set, smoothing, edges, grey map.
 
 The coherent sum is taken anew for each look, of a part of the band and from another direction, and their powers are averaged.
-Then come clutter, gain, logarithm, smoothing, interpolation between lines, despeckling, smoothing along streaks, edge enhancement,
-persistence, the grey map and compression.
+Then come clutter, gain, logarithm, smoothing, interpolation between lines, despeckling, smoothing along streaks, edge
+enhancement, persistence, the grey map and compression.
 """
 
 from typing import Annotated
@@ -111,7 +111,7 @@ def _softened(share: Image, width_mm: float, line_mm: float, row_mm: float) -> I
 
 
 def _along_streaks(share: Image, reach_mm: float, line_mm: float, row_mm: float) -> Image:
-    """Means to either side along the direction of least change, of the tensor of slopes in 0.6 mm about: Weickert 1999, in one step.
+    """Means to either side along the direction of least change, by the tensor of slopes 0.6 mm about: a step of Weickert 1999.
 
     Weights fall linearly to none at `reach_mm`. Where no direction stands out, the smoothing is as much shorter.
     """
@@ -125,7 +125,8 @@ def _along_streaks(share: Image, reach_mm: float, line_mm: float, row_mm: float)
     total, weights, steps = share.copy(), 1.0, 4
     for step in (*range(-steps + 1, 0), *range(1, steps)):
         far, weight = np.float32(reach_mm * step / steps), 1 - abs(step) / steps
-        total += weight * cv2.remap(share, column + far * aside, row + far * down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        places = column + far * aside, row + far * down
+        total += weight * cv2.remap(share, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         weights += weight
     return total / np.float32(weights)
 

@@ -114,7 +114,7 @@ def test_without_refraction_nothing_is_shifted():
 
 
 def test_bent_beams_carry_no_more_power_than_straight_ones():
-    """Behind a slow rod, which draws lines together and apart: power a line, of even scatterers, stays within 1.2 dB over 2 mm."""
+    """Behind a slow rod, which draws lines together and apart: power a line, of even scatterers, stays within 1.2 dB."""
     rod = Thing("rod", solid_meshes.moved(trimesh.creation.cylinder(6.0, 60.0, sections=96), ACROSS), Material(0.3))
     found = paths((rod, replace(WATER, speed=1440.0, impedance=1.5)))
     level, pitch = 340, ARRAY.scale_mm_per_px[0]

@@ -6,7 +6,17 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from scenes.scene_types import Layer, Layers
 from twin.ultrasound import grown_layers
-from twin.ultrasound.grown_layers import FAR_MM, NONE, layer_at, layer_distance, layer_normal, packed, patch_at, strand_at, uneven_at
+from twin.ultrasound.grown_layers import (
+    FAR_MM,
+    NONE,
+    layer_at,
+    layer_distance,
+    layer_normal,
+    packed,
+    patch_at,
+    strand_at,
+    uneven_at,
+)
 
 STEP_MM = 0.8
 FIRST = np.array([-5.0, 3.0, 600.0])
@@ -24,7 +34,8 @@ def layers():
         Layer("lump", fields[2]),
         Layer("last", fields[3] + 2),
     ]
-    return Layers("body", FIRST, STEP_MM, tuple(grown), *(gaussian_filter(rng.standard_normal(SHAPE), 1).astype(np.float32) for _ in range(2)))
+    uneven, strata = (gaussian_filter(rng.standard_normal(SHAPE), 1).astype(np.float32) for _ in range(2))
+    return Layers("body", FIRST, STEP_MM, tuple(grown), uneven, strata)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +93,10 @@ def test_unevenness_is_that_of_the_nearest_grid_point(layers):
 
 
 def test_strands_follow_strata():
-    """On tilted strata : along one the unevenness stays for millimetres, across it changes within half of one; its variance is 1."""
+    """On tilted strata: along one the unevenness stays for millimetres, across it changes within one; its variance is 1."""
     axes = np.meshgrid(*(STEP_MM * np.arange(n) for n in SHAPE), indexing="ij")
-    tilted = packed(Layers("body", FIRST, STEP_MM, (Layer("whole", axes[0]),), axes[0], (axes[2] - 0.4 * axes[0]).astype(np.float32)))
+    strata = (axes[2] - 0.4 * axes[0]).astype(np.float32)
+    tilted = packed(Layers("body", FIRST, STEP_MM, (Layer("whole", axes[0]),), axes[0], strata))
     rng = np.random.default_rng(5)
     places = FIRST + rng.uniform(2, 7, (3000, 3))
 
