@@ -7,7 +7,7 @@ temperature: [L] Li, Villa, Park & Anastasio 2022, IEEE Trans. UFFC 69(1) (speed
 measured tumours); [F] Nasief et al. 2015, J. Ultrasound Med. 34(11) (attenuation and backscatter of breast fat); [N] Nam et al.
 2013, Ultrason. Imaging 35(2) (masses); [I] Hasgall et al., IT'IS tissue data base 4.1. Young's moduli: fat 3.25
 and gland 3.24 kPa [Samani, Zubovits & Plewes 2007, Phys. Med. Biol. 52(6)], others assumed: skin, ligaments and fascia some 20
-times as stiff, a phantom's tumours thrice as its rest.
+times as stiff, a phantom's tumours thrice as its rest. How uneven strands are is assumed by the look of published images.
 """
 
 from dataclasses import replace
@@ -41,19 +41,19 @@ TISSUES = {
     "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03, modulus_kpa=1e7),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
     "skin": Tissue(
-        1.72, 1555.0, 1.84, 10.0, 0.03, True, modulus_kpa=60.0
+        1.72, 1555.0, 1.84, 10.0, 0.03, True, strands_db=2.0, modulus_kpa=60.0
     ),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; bright, assumed
     "fat": Tissue(1.31, 1440.0, 0.73, 0.0, 0.04, True),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
     "ligament": Tissue(
         1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0, modulus_kpa=60.0
     ),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
     "gland": Tissue(
-        1.60, 1540.0, 0.75, 10.0, 0.02, True, modulus_kpa=3.24
+        1.60, 1540.0, 0.75, 10.0, 0.02, True, strands_db=4.5, modulus_kpa=3.24
     ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 10 times the echo of fat [A]
     "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True, modulus_kpa=3.24),  # fluid and walls, assumed
     "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True, modulus_kpa=15.0),  # dense connective tissue that shadows, assumed
     "muscle": Tissue(
-        1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0, modulus_kpa=10.0
+        1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0, 5.5, modulus_kpa=10.0
     ),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
     "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0, modulus_kpa=60.0),  # as ligaments and tendons [I]; echoes assumed
     "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05, modulus_kpa=1e7),  # 1908 kg/m3, 3515 m/s, attenuation [I]

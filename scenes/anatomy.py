@@ -40,8 +40,12 @@ class Anatomy(Part):
     """of the gland, by the classes of BI-RADS"""
     skin_mm: Annotated[float, Field(ge=0.3, le=5)] = 1.6
     """thickness of the skin [Willson et al. 1982: 1.62 in mammograms; Warszawski: 1.68 by ultrasound]"""
+    skin_uneven: Annotated[float, Field(ge=0, le=0.4)] = 0.22
+    """standard deviation of the skin's thickness over some 12 mm, of it; assumed"""
     areola_skin_mm: Annotated[float, Field(ge=0, le=5)] = 0.8
     """by which the skin is thicker at the areola; assumed"""
+    septum_mm: Annotated[float, Field(ge=1.5, le=40)] = 4.0
+    """from septum to septum along the skin, many of them broken; assumed"""
     lobule_mm: Annotated[float, Field(ge=4, le=40)] = 18.0
     """width of fat lobules, which are 0.45 of it thick: patients lie on their backs; assumed"""
     ligament_mm: Annotated[float, Field(ge=0.05, le=2)] = 0.25
@@ -56,7 +60,7 @@ class Anatomy(Part):
     """thickness of the pectoral muscle; assumed"""
     rib_mm: Positive = 32.0
     """from rib to rib; assumed"""
-    uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.6
+    uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.2
     """standard deviation of the backscatter within a tissue, over 2 to 8 mm, and twice that within gland and muscle; assumed"""
     voxel_mm: Annotated[float, Field(ge=0.7, le=2)] = 1.0
     """of the grid"""
@@ -86,6 +90,7 @@ class GrownBreast:
     grid: Grid
     layers: tuple[Layer, ...]  # the first one, all under the skin, holds the others, of which the later ones count
     uneven_db: Volume  # backscatter over its tissue's
+    strata_mm: Volume  # place across its strands, which lie along the skin, and farther down along the muscle
     depth: Volume  # mm under the skin
 
 
@@ -102,13 +107,15 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
     depth = _depth_under(skin, grid)
     nipple = skin.vertices[skin.vertices[:, 2].argmax()]
     from_nipple = np.hypot(x - nipple[0], y - nipple[1])
-    skin_mm = anatomy.skin_mm + anatomy.areola_skin_mm * np.exp(-((from_nipple / 14) ** 2))
+    skin_mm = anatomy.skin_mm * (1 + anatomy.skin_uneven * noise.plane(12).clip(-2, 2)) + 0.1 * noise(4)
+    skin_mm = skin_mm + anatomy.areola_skin_mm * np.exp(-((from_nipple / 14) ** 2))
     muscle = (z - 4 - 1.5 * noise.plane(60)).astype(np.float32)  # height over the muscle
     chest_mm = 3 + 0.0002 * (x**2 + y**2)  # by which the chest falls away to the sides
     muscle = np.maximum(muscle + chest_mm, skin_mm + 2 - depth).astype(np.float32)
 
     gland = _gland(anatomy, grid, noise, depth, muscle, from_nipple)
-    sheets = _ligaments(anatomy, grid, noise)
+    strata = _strata(depth, muscle, noise)
+    sheets = _ligaments(anatomy, grid, noise, strata)
     layers = [
         Layer("fat", _cut(skin_mm - depth), mirrors=True),
         *(Layer(f"ligament{k}", sheet, half_mm=anatomy.ligament_mm / 2) for k, sheet in enumerate(sheets)),
@@ -124,12 +131,12 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
         Layer("rib", _ribs(anatomy, grid, muscle), mirrors=True),
         Layer("lung", _cut(muscle + anatomy.muscle_mm + 11), mirrors=True),
     ]
-    coarse, strands = noise(7), noise((9, 9, 1.5))  # of fat, and of gland and muscle: fibres that lie about level
+    coarse, strands = noise(7), _along(strata, grid, noise((9, 9, 1.5)))  # of fat, and of gland and muscle: bundles along strata
     streaky = (muscle < 0) | (gland < 0)
     spread_db = anatomy.uneven_db * np.where(streaky, 2.0, 1.0)
     uneven = spread_db * np.where(streaky, (2 * strands + coarse) / np.sqrt(5), (strands + coarse) / np.sqrt(2))
     uneven -= np.log(10) / 20 * spread_db**2  # so that the mean power is the tissue's
-    return GrownBreast(grid, tuple(layers), uneven.astype(np.float32), depth)
+    return GrownBreast(grid, tuple(layers), uneven.astype(np.float32), strata, depth)
 
 
 def in_world(layer: Volume, grid: Grid, world_from_phantom: Array) -> tuple[Volume, Array]:
@@ -237,30 +244,56 @@ def _gland(anatomy: Anatomy, grid: Grid, noise: _Noise, depth: Volume, muscle: V
     return np.maximum(redistance(level - ragged, grid.step), redistance(fat, grid.step))
 
 
-def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise) -> list[Volume]:
-    """Distances to two sets of sheets, of sign: borders of Voronoi cells that fall to different sides of a toss.
+def _strata(depth: Volume, muscle: Volume, noise: _Noise) -> Volume:
+    """Place across strands, mm: even shares of the way from the skin to the muscle, wavy, and below along the muscle."""
+    way_mm = 45.0  # from skin to muscle, where it is its true length
+    above, below = np.maximum(muscle, 0), np.maximum(-muscle, 0)
+    level = way_mm * depth / np.maximum(depth + above, way_mm / 2) + below
+    wavy = 1.3 * noise((18, 18, 9)) + 0.35 * noise((5, 5, 4))
+    return (gaussian_filter(level, 1.0) + wavy).astype(np.float32)
 
-    Two tosses part three quarters of neighbours, so that some lobules hang together. Distances are stretched where sheets are
-    thin, never beyond the true ones.
+
+def _along(strata: Volume, grid: Grid, field: Volume) -> Volume:
+    """A field's values where its heights are the strata."""
+    i, j, _ = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in grid.shape), indexing="ij")
+    laid = map_coordinates(field, [i, j, strata / np.float32(grid.step)], order=1, mode="grid-wrap")
+    return laid / laid.std()
+
+
+def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise, strata: Volume) -> list[Volume]:
+    """Distances to two sets of sheets, of sign: Cooper's ligaments, and septa that lie along the strata.
+
+    Ligaments are borders of Voronoi cells that fall to different sides of one of two tosses, which part three quarters of
+    neighbours, so that some lobules hang together. Septa are wavy, and taper to nothing here and there. Distances are stretched
+    or shrunk as sheets are thinner or thicker.
     """
     lobule = anatomy.lobule_mm * np.array([1, 1, 0.45])
-    warp = [0.22 * anatomy.lobule_mm * noise(anatomy.lobule_mm) for _ in range(3)]
-    scaled = np.stack([(axis + bent) / size for axis, bent, size in zip(grid.axes(), warp, lobule, strict=True)], axis=-1)
+    warp = [0.22 * anatomy.lobule_mm * noise(anatomy.lobule_mm) + 0.5 * noise(4) for _ in range(3)]
+    places = (*grid.axes()[:2], strata)
+    scaled = np.stack([(axis + bent) / size for axis, bent, size in zip(places, warp, lobule, strict=True)], axis=-1)
     low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
     cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
     seeds = cells.reshape(-1, 3) + 0.5 + noise.rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
     distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
-    thick = noise(20)
-    sheets = []
+    cooper: Array = np.full(grid.shape, np.inf)
     for _ in range(2):
         side = noise.rng.random(len(seeds)) < 0.5
         heads = side[nearest]
         to_heads, to_tails = (np.where(kind, distance, np.inf).min(axis=1) for kind in (heads, ~heads))
         gap = np.clip((to_tails - to_heads) / 2, -0.5, 0.5).reshape(grid.shape)
         slope = np.linalg.norm(np.gradient(gap, grid.step), axis=0)
-        true = gap / np.maximum(slope, 0.5 / anatomy.lobule_mm)
-        sheets.append(_cut(true * np.exp(0.6 * (thick - 1)).clip(0.25, 1)))
-    return sheets
+        cooper = _either(cooper, gap / np.maximum(slope, 0.5 / anatomy.lobule_mm))
+    thin = np.exp(0.7 * (_along(strata, grid, noise((12, 12, 5))) + 0.5 * noise(4) - 0.6)).clip(0.25, 8)
+    spacing = anatomy.septum_mm / np.pi
+    level = strata + 2.0 * noise((16, 16, 8)) + 0.6 * noise((5, 5, 5))
+    septum = spacing * np.sin(level / spacing)
+    faint = np.exp(1.2 * (_along(strata, grid, noise((11, 11, 4))) + 0.5 * noise(4)) + 0.3).clip(0.3, 12)
+    return [_cut(cooper * thin), _cut(septum * faint)]
+
+
+def _either(one: Array, other: Array) -> Array:
+    """Distances, of sign, to the nearer of two sheets."""
+    return np.where(np.signbit(one) == np.signbit(other), 1, -1) * np.minimum(np.abs(one), np.abs(other))
 
 
 def _ducts(anatomy: Anatomy, grid: Grid, gland: Volume, nipple: Array, rng: np.random.Generator) -> Volume:

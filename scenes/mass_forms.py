@@ -22,7 +22,8 @@ def mass(form: MassForm, size_mm: float, rng: np.random.Generator) -> trimesh.Tr
         case "round":
             radius, aspect = 1 + 0.02 * smooth_noise(directions, 1.5, rng), (1.0, 0.95, 0.92)
         case "oval":
-            radius, aspect = 1 + 0.03 * smooth_noise(directions, 1.5, rng), (1.0, 0.75, 0.6)
+            uneven = 0.03 * smooth_noise(directions, 1.5, rng) + 0.025 * smooth_noise(directions, 0.6, rng)
+            radius, aspect = 1 + uneven + 0.008 * smooth_noise(directions, 0.25, rng), (1.0, 0.75, 0.6)
         case "irregular":
             uneven = 0.16 * smooth_noise(directions, 1.3, rng) + 0.06 * smooth_noise(directions, 0.6, rng)
             radius, aspect = np.exp(uneven + 0.012 * smooth_noise(directions, 0.3, rng)), (1.0, 0.9, 0.8)

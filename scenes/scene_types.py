@@ -91,6 +91,7 @@ class Layers:
     step_mm: float
     layers: tuple[Layer, ...]
     uneven_db: NDArray[np.float32]  # (nx, ny, nz) backscatter over its tissue's
+    strata_mm: NDArray[np.float32]  # (nx, ny, nz) place across the strands of tissue, which lie along its level faces
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ class Tissue:
     roughness: float = 0.0  # mm, standard deviation of its surface over less than a wavelength
     soft: bool = False  # whether its speed goes with that of all soft tissue
     fibres_db: float = 0.0  # by which a layer of fibres is brighter where sound meets it squarely
+    strands_db: float = 0.0  # standard deviation of the backscatter from strand to strand, where layers have grown
     specks_per_mm3: float = 0.0  # calcifications
     modulus_kpa: float = 3.25  # Young's, at small strains
 

@@ -19,6 +19,7 @@ from scenes.kinds.breast import Outside, albedo, check_depth, closed, form_of, w
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
+from scenes.tumour import caliper
 
 MADE_OF = {  # for ultrasound; see `scenes.acoustics`
     "": "gel",
@@ -40,10 +41,12 @@ ECHOES: dict[Pattern, float | None] = {
     "complex": None,
 }
 """dB over fat, the reference of BI-RADS; carcinomas and fibroadenomas of Nam et al. 2013 lie 2 to 12 dB below the gland"""
-LOSSES: dict[Behind, float] = {"none": 0.8, "enhancement": 0.3, "shadow": 2.2}
+LOSSES: dict[Behind, float] = {"none": 0.8, "enhancement": 0.3, "shadow": 1.6}
 """dB/cm/MHz; what lies above and beside a mass loses some 0.75"""
 CIRCUMSCRIBED: tuple[MassForm, ...] = ("round", "oval", "lobulated")
 """forms with an even border, which shines where sound meets it squarely; others have no rim"""
+FLAT: dict[MassForm, float] = {"round": 0.92, "oval": 0.7, "lobulated": 0.75, "irregular": 0.9, "spiculated": 1.0}
+"""height over what the form would have: benign masses lie along the tissue's planes, wider than tall; shares assumed"""
 MODULI: dict[Pattern, float] = {"anechoic": 1.0, "hypoechoic": 16.0, "isoechoic": 6.4, "hyperechoic": 3.25, "complex": 2.0}
 """kPa: carcinomas 10 to 42, fibroadenomas 6.4 [Samani et al. 2007]; cysts assumed, lipomas as fat"""
 SPEEDS: dict[Pattern, float] = {
@@ -129,13 +132,20 @@ def build(config: Config) -> Scene:
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
     for k, (wanted, rng) in enumerate(zip(config.masses, mass_rng.spawn(len(config.masses)), strict=True)):
-        body = solid_meshes.moved(mass(wanted.form, wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
+        lying = _flattened(mass(wanted.form, wanted.size_mm, rng), FLAT[wanted.form])
+        body = solid_meshes.moved(lying, rigid.transform(np.eye(3), wanted.centre_mm))
         check_depth(f"masses.{k}", body, skin, config.least_mm)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
     return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world))
+
+
+def _flattened(body: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
+    """A mass of a height over its own, of the same greatest extent."""
+    vertices = body.vertices * [1, 1, height]
+    return trimesh.Trimesh(vertices * (caliper(body.vertices) / caliper(vertices)), body.faces, process=False)
 
 
 def _solid_part(name: str, wanted: Mass, rng: np.random.Generator, world: rigid.Array) -> Thing:
@@ -160,4 +170,5 @@ def _layers(anatomy: Anatomy, skin: Dome, seed: int, world: rigid.Array) -> Laye
         distance, _ = in_world(layer.distance, grown.grid, world)
         layers.append(Layer(layer.name, distance, layer.half_mm, layer.mirrors))
     uneven, origin = in_world(grown.uneven_db, grown.grid, world)
-    return Layers("breast", origin, grown.grid.step, tuple(layers), uneven)
+    strata, _ = in_world(grown.strata_mm, grown.grid, world)
+    return Layers("breast", origin, grown.grid.step, tuple(layers), uneven, strata)

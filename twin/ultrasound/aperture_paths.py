@@ -50,7 +50,30 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
     half = receive_aperture(transducer, depths) / 2
     out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(4)))
     in_threads(_gather, count, out, along, tangents, half, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
-    return out
+    return _evened(out, depths * (tangents[1] - tangents[0]) / lines.pitch_mm, lines.pitch_mm) if transducer.refraction else out
+
+
+def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
+    """Paths whose shifts and foci are means over the gaps between rays, and whose amplitudes keep the power of bent beams.
+
+    Rays stand so many lines `apart` : (levels,), so that their tilts change from line to line by more than a whole aperture's.
+    Where shifts crowd places on a line it holds more scatterers, but no beam carries more power for being bent.
+    """
+    count = len(paths.labels)
+    half = np.minimum(np.rint(apart / 2).astype(int), count // 2)
+    line, level = np.arange(count)[:, None], np.arange(len(apart))[None]
+    first, end = np.maximum(line - half, 0), np.minimum(line + half + 1, count)
+
+    def mean(table: Array) -> Array:
+        sums = np.concatenate([np.zeros_like(table[:1], float), np.cumsum(table, axis=0, dtype=float)])
+        return (sums[end, level] - sums[first, level]) / (end - first)
+
+    focus = mean(paths.focus)
+    seen = np.sort(pitch_mm * line - mean(paths.shift_mm), axis=0)  # lines never cross, or one would gather the power of three
+    shift = mean(pitch_mm * line - seen)
+    thinned = np.clip(1 - np.gradient(shift, pitch_mm, axis=0), 0.05, 4.0)
+    amplitude = paths.amplitude * np.sqrt(thinned)
+    return Paths(paths.step_mm, paths.labels, paths.shown_mm, *(part.astype(np.float32) for part in (amplitude, shift, focus)))
 
 
 @kernel

@@ -29,6 +29,7 @@ from twin.ultrasound.mesh_distance import Grid, signed_distances
 
 Array = NDArray[np.float64]
 
+MARGINS_MM = 0.8, 0.2  # by which ragged and even borders of what lies in grown tissue are blurred to either side; assumed
 MARGIN_MM = 3.0  # of the grids, around the solid, and most of a mesh's distance
 
 FIRST, NX, NY, NZ = range(4)  # columns of `Solids.grid`
@@ -56,6 +57,7 @@ class Tissues(NamedTuple):
     roughness: Array  # mm
     fibres: Array  # nepers of amplitude by which a layer of fibres is brighter where it is met squarely
     specks: Array  # calcifications a mm3
+    strands: Array  # nepers, standard deviation of the amplitude from strand to strand
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,9 +151,9 @@ class Body:
         """The tissues' figures at a frequency, for compiled code."""
         loss = self.column("attenuation") * frequency_mhz * np.log(10) / 100  # from dB/cm/MHz
         fibres = self.column("fibres_db") * np.log(10) / 20
-        return Tissues(
-            self.column("impedance"), self.column("speed"), loss, self.column("roughness"), fibres, self.column("specks_per_mm3")
-        )
+        strands = self.column("strands_db") * np.log(10) / 20
+        figures = (self.column(name) for name in ("impedance", "speed"))
+        return Tissues(*figures, loss, self.column("roughness"), fibres, self.column("specks_per_mm3"), strands)
 
     def column(self, name: str) -> Array:
         """A figure of the tissues by label : (n + 1,)."""
@@ -347,8 +349,8 @@ def label_at(solids, x, y, z):
 
 
 @njit(inline="always")
-def resting_label(solids, x, y, z):
-    """Label of a point of a body at rest."""
+def resting_label(solids, x, y, z, beside=0.0):
+    """Label of a point of a body at rest; what lies over layers holds it from as far beside its border, of its MARGINS_MM."""
     (first, end), grown = solids.layers, solids.grown
     for k in range(len(solids.grid) - 1, -1, -1):
         if first <= k < end:
@@ -356,6 +358,6 @@ def resting_label(solids, x, y, z):
                 layer = layer_at(grown.sure, grown.distance, grown.half_mm, grown.first, grown.per_mm, x, y, z)
                 if layer != NONE:
                     return first + layer + 1
-        elif own_distance(solids, k, x, y, z) <= 0:
+        elif own_distance(solids, k, x, y, z) <= (beside * MARGINS_MM[int(solids.mirrors[k])] if first < end <= k else 0.0):
             return k + 1
     return 0

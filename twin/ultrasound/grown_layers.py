@@ -4,12 +4,14 @@ Kernels are compiled apart from their callers, and take no more than what they r
 """
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
-from recon.compiled import kernel
+from recon.compiled import kernel, njit
 from scenes.scene_types import Layer, Layers
 from twin.trilinear import cell_at, within
 
@@ -17,6 +19,9 @@ Array = NDArray[np.float64]
 
 NONE, MIXED = -1, -2  # of a cell: that no layer holds it, or that borders run through it
 FAR_MM = 1e3  # beside the grid
+STRANDS = 64, 64, 192  # values of the unevenness from strand to strand, powers of two but for the last
+STRAND_STEPS_MM = 0.7, 0.7, 0.1  # between them, along and across
+PATCH_MM = 0.6  # between them along all axes, where they make borders patchy
 
 
 class Grown(NamedTuple):
@@ -28,17 +33,32 @@ class Grown(NamedTuple):
     first: Array  # (3,) mm in the world, the first grid point
     per_mm: float  # grid points
     uneven: NDArray[np.float32]  # (nx, ny, nz) amplitude of backscatter over its tissue's
+    strata: NDArray[np.float32]  # (nx, ny, nz) mm across the strands of tissue
+    strands: NDArray[np.float32]  # (n, n, m) unevenness from strand to strand, of unit variance, over and over
 
 
 def packed(layers: Layers | None) -> Grown:
     """Layers for compiled code."""
     if layers is None:
         empty = np.zeros((0, 0, 0), np.float32)
-        return Grown(empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty)
+        return Grown(empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty, empty, empty)
     distance = np.stack([one.distance for one in layers.layers], axis=-1)
     half = np.array([one.half_mm for one in layers.layers], np.float32)
     uneven = np.exp(layers.uneven_db * np.float32(np.log(10) / 20))
-    return Grown(distance, _sure(layers.layers), half, np.asarray(layers.origin, float), 1 / layers.step_mm, uneven)
+    place = np.asarray(layers.origin, float), 1 / layers.step_mm
+    return Grown(distance, _sure(layers.layers), half, *place, uneven, layers.strata_mm, _strands())
+
+
+@cache
+def _strands() -> NDArray[np.float32]:
+    """Values that go over and over : of strands some 4 mm long and 0.4 mm thick, and of bundles twice as large."""
+    rng = np.random.default_rng(0)
+    total = np.zeros(STRANDS, np.float32)
+    for scale, share in ((1.0, 1.0), (2.2, 0.8)):
+        sigma = scale * np.array([1.25, 1.25, 0.12]) / STRAND_STEPS_MM
+        smooth = gaussian_filter(rng.standard_normal(STRANDS, dtype=np.float32), sigma, mode="wrap")
+        total += np.float32(share) * smooth / smooth.std()
+    return total / total.std()
 
 
 def _sure(layers: Sequence[Layer]) -> NDArray[np.int8]:
@@ -121,3 +141,31 @@ def uneven_at(uneven, first, per_mm, x, y, z):
     if i < 0 or j < 0 or k < 0 or i >= uneven.shape[0] or j >= uneven.shape[1] or k >= uneven.shape[2]:
         return np.float32(1)
     return uneven[i, j, k]
+
+
+@kernel
+def strand_at(strata, strands, first, per_mm, x, y, z):
+    """Unevenness from strand to strand at a point of the world: of what lies along one face, from the same strand."""
+    cell = cell_at(first, per_mm, strata.shape, x, y, z)
+    if cell.i < 0:
+        return np.float32(0)
+    i, j, k, a, b, c = cell.i, cell.j, cell.k, cell.a, cell.b, cell.c
+    near = (strata[i, j, k] * (1 - c) + strata[i, j, k + 1] * c) * (1 - b)
+    near += (strata[i, j + 1, k] * (1 - c) + strata[i, j + 1, k + 1] * c) * b
+    far = (strata[i + 1, j, k] * (1 - c) + strata[i + 1, j, k + 1] * c) * (1 - b)
+    far += (strata[i + 1, j + 1, k] * (1 - c) + strata[i + 1, j + 1, k + 1] * c) * b
+    level = near * (1 - a) + far * a
+    return _tiled(strands, x / STRAND_STEPS_MM[0], y / STRAND_STEPS_MM[1], level / STRAND_STEPS_MM[2])
+
+
+@kernel
+def patch_at(strands, x, y, z):
+    """Share of an even border's echo that a patch of it sends back: patches of 2 to 4 mm, some of them hardly any."""
+    return np.float32(1 / (1 + np.exp(1.2 - 2.5 * _tiled(strands, x / PATCH_MM, y / PATCH_MM, z / PATCH_MM))))
+
+
+@njit(inline="always")
+def _tiled(values, u, v, w):
+    """The nearest of values that go over and over."""
+    i, j, k = int(np.floor(u + 0.5)), int(np.floor(v + 0.5)), int(np.floor(w + 0.5))
+    return values[i % values.shape[0], j % values.shape[1], k % values.shape[2]]

@@ -24,7 +24,7 @@ from twin.ultrasound.echo_solids import (
     resting_distance,
     resting_label,
 )
-from twin.ultrasound.grown_layers import layer_normal, uneven_at
+from twin.ultrasound.grown_layers import layer_normal, strand_at, uneven_at
 from twin.ultrasound.scan_lines import on_lines, widening
 from twin.ultrasound.sound_paths import GRADIENT_MM, Paths
 from twin.ultrasound.transducer import Transducer
@@ -290,7 +290,7 @@ def _lay_echoes(field, places, found, solids, lattice, scanner, beam, paths):
         along, y, z, label = places[ALONG, n], places[DEPTH, n], places[Z, n], int(places[LABEL, n])
         if label == NEAR_BORDER:
             wx, wy, wz = _resting_place(solids, places, n, scanner.world_from_face)
-            label = resting_label(solids, wx, wy, wz)
+            label = resting_label(solids, wx, wy, wz, places[P, n] / 2 ** (BITS - 1) - 1)
         strength = lattice.strength[label]
         if solids.layers[0] < solids.layers[1]:
             strength = _uneven_strength(solids, lattice, label, places, n, scanner)
@@ -334,16 +334,19 @@ def _resting_place(solids, places, n, pose):
 
 @njit(inline="always")
 def _uneven_strength(solids, lattice, label, places, n, scanner):
-    """Strength of a scatterer of uneven tissue, of fibres that lie along a layer's faces, or of a calcification."""
+    """Strength of a scatterer of uneven tissue, of strands and fibres that lie along a layer's faces, or of a calcification."""
     if lattice.tissues.specks[label] > 0 and _is_speck(places, n, lattice, label, scanner.seed):
         return lattice.speck
     value = lattice.strength[label]
     if value == 0:
         return value
-    pose, fibres = scanner.world_from_face, lattice.tissues.fibres[label]
+    pose, fibres, spread = scanner.world_from_face, lattice.tissues.fibres[label], lattice.tissues.strands[label]
     wx, wy, wz = _resting_place(solids, places, n, pose)
     grown = solids.grown
     value *= uneven_at(grown.uneven, grown.first, grown.per_mm, wx, wy, wz)
+    if spread > 0:  # of the tissue's mean power
+        strand = strand_at(grown.strata, grown.strands, grown.first, grown.per_mm, wx, wy, wz)
+        value *= np.float32(np.exp(spread * (strand - spread)))
     if fibres > 0 and solids.layers[0] < label <= solids.layers[1]:
         value *= _fibres(solids, label - 1, pose, wx, wy, wz, fibres)
     return value

@@ -1,8 +1,8 @@
 """What a scanner makes of echoes before it shows them: compounding, gain as set, smoothing, edges, grey map.
 
 The coherent sum is taken anew for each look, of a part of the band and from another direction, and their powers are averaged.
-Then come clutter, gain, logarithm, smoothing, interpolation between lines, despeckling, edge enhancement, persistence, the grey
-map and compression.
+Then come clutter, gain, logarithm, smoothing, interpolation between lines, despeckling, smoothing along streaks, edge
+enhancement, persistence, the grey map and compression.
 """
 
 from typing import Annotated
@@ -38,6 +38,10 @@ class Picture(Part):
     """share of a smoothing that spares edges (a guided filter)"""
     despeckle_mm: Annotated[float, Field(gt=0, le=5)] = 0.8
     """width of its windows"""
+    streaks: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """share of a smoothing along what runs through the picture: fibres, borders, or the grains' own length (line integrals)"""
+    streaks_mm: Annotated[float, Field(gt=0, le=5)] = 1.0
+    """over which it is smoothed, to either side"""
     edges: Annotated[float, Field(ge=0, le=3)] = 0.0
     """by which what differs from its surroundings is amplified (an unsharp mask)"""
     edges_mm: Annotated[float, Field(gt=0, le=5)] = 0.5
@@ -73,6 +77,8 @@ def processed(share: Image, picture: Picture, line_mm: float, row_mm: float) -> 
         shown = _interpolated(shown, picture.line_mm / line_mm)
     if picture.despeckle:
         shown = shown + np.float32(picture.despeckle) * (_softened(shown, picture.despeckle_mm, line_mm, row_mm) - shown)
+    if picture.streaks:
+        shown = shown + np.float32(picture.streaks) * (_along_streaks(shown, picture.streaks_mm, line_mm, row_mm) - shown)
     if picture.edges:
         blurred = gaussian_filter(shown, (picture.edges_mm / row_mm, picture.edges_mm / line_mm), mode="nearest")
         shown = np.clip(shown + np.float32(picture.edges) * (shown - blurred), 0, 1)
@@ -102,6 +108,27 @@ def _softened(share: Image, width_mm: float, line_mm: float, row_mm: float) -> I
     variance = np.maximum(square - mean * mean, 0)
     slope = variance / (variance + np.float32(grains))
     return cv2.blur(slope, window) * share + cv2.blur((1 - slope) * mean, window)
+
+
+def _along_streaks(share: Image, reach_mm: float, line_mm: float, row_mm: float) -> Image:
+    """Means to either side along the direction of least change, by the tensor of slopes 0.6 mm about: a step of Weickert 1999.
+
+    Weights fall linearly to none at `reach_mm`. Where no direction stands out, the smoothing is as much shorter.
+    """
+    blur = cv2.GaussianBlur(share, (0, 0), 0.15 / line_mm, sigmaY=0.15 / row_mm)
+    x, y = cv2.Sobel(blur, -1, 1, 0, scale=1 / line_mm), cv2.Sobel(blur, -1, 0, 1, scale=1 / row_mm)
+    xx, xy, yy = (cv2.GaussianBlur(part, (0, 0), 0.6 / line_mm, sigmaY=0.6 / row_mm) for part in (x * x, x * y, y * y))
+    angle = np.arctan2(2 * xy, xx - yy) / 2 + np.float32(np.pi / 2)
+    length = np.hypot(2 * xy, xx - yy) / np.maximum(xx + yy, 1e-9)  # share of the slopes that agree
+    aside, down = np.cos(angle) * length / np.float32(line_mm), np.sin(angle) * length / np.float32(row_mm)
+    row, column = np.mgrid[: share.shape[0], : share.shape[1]].astype(np.float32)
+    total, weights, steps = share.copy(), 1.0, 4
+    for step in (*range(-steps + 1, 0), *range(1, steps)):
+        far, weight = np.float32(reach_mm * step / steps), 1 - abs(step) / steps
+        places = column + far * aside, row + far * down
+        total += weight * cv2.remap(share, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        weights += weight
+    return total / np.float32(weights)
 
 
 def _interpolated(share: Image, columns: float) -> Image:

@@ -16,6 +16,7 @@ from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
 from twin.ultrasound.echo_solids import Body, Wire, distance_at, label_at, resting_distance, resting_place, shrinking
+from twin.ultrasound.grown_layers import patch_at
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
 from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
@@ -37,6 +38,7 @@ FROM, TO, DEPTH = range(3)  # columns of a ray's crossings: labels before and be
 CROSSINGS = 256  # of a ray, at most
 BEFORE, AFTER, LAST = range(3)  # rows of the solids' distances, of a step of the march and at the end of a span
 SURE = 0.9  # of a distance: no border is nearer
+BONE = 0.4  # reflection, from which a border in grown tissue is whole; those of soft tissues are patchy
 BESIDE_BORDER_MM = 0.05  # on either side of which tissues are looked up
 
 
@@ -308,6 +310,9 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
     seen = paths.shown_mm[line, level] + (y - level * paths.step_mm) * scanner.assumed_speed / speed[here]
     left = paths.amplitude[line, level]
     r = reflection(impedance[here], impedance[there], speed[here], speed[there], square)
+    whole = 1.0
+    if solids.layers[0] < solids.layers[1] and abs(r) < BONE:
+        whole = patch_at(solids.grown.strands, *resting_place(solids, ray.x + ray.dx * y, ray.y + ray.dy * y, ray.z + ray.dz * y))
     mirror = np.exp(-0.5 * (2 * scanner.wavenumber * tissues.roughness[solid + 1] * square) ** 2)
     line_mm = scanner.line_mm * widening(y, scanner.bend)
     area, carrier = line_mm / SUBLINES * ACROSS_MM, _turned(2 * scanner.wavenumber * seen)
@@ -326,7 +331,7 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
                 phase = _phase_of_patch(at[0], at[1], at[2], scanner.seed)
                 value += _scatter(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
             if value != 0:
-                echo = np.complex64(strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]
+                echo = np.complex64(whole * strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]
                 beside = paths.shift_mm[line, min(int(order * y / paths.step_mm), depths - 1)]
                 across = (ray.along - beside / widening(order * y, scanner.bend)) / scanner.line_mm + (len(field) - lines) // 2
                 deposit(field, across, order * seen / scanner.sample_mm, echo)

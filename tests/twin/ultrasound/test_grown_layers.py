@@ -5,7 +5,18 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from scenes.scene_types import Layer, Layers
-from twin.ultrasound.grown_layers import FAR_MM, NONE, layer_at, layer_distance, layer_normal, packed, uneven_at
+from twin.ultrasound import grown_layers
+from twin.ultrasound.grown_layers import (
+    FAR_MM,
+    NONE,
+    layer_at,
+    layer_distance,
+    layer_normal,
+    packed,
+    patch_at,
+    strand_at,
+    uneven_at,
+)
 
 STEP_MM = 0.8
 FIRST = np.array([-5.0, 3.0, 600.0])
@@ -23,7 +34,8 @@ def layers():
         Layer("lump", fields[2]),
         Layer("last", fields[3] + 2),
     ]
-    return Layers("body", FIRST, STEP_MM, tuple(grown), gaussian_filter(rng.standard_normal(SHAPE), 1).astype(np.float32))
+    uneven, strata = (gaussian_filter(rng.standard_normal(SHAPE), 1).astype(np.float32) for _ in range(2))
+    return Layers("body", FIRST, STEP_MM, tuple(grown), uneven, strata)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +76,7 @@ def test_distances_are_those_of_faces(layers, points):
 def test_normals_point_outwards_from_both_faces_of_a_sheet():
     """A level sheet: up above its middle, down below it; and outside the grid none fails."""
     height = np.broadcast_to(STEP_MM * (np.arange(SHAPE[2]) - 7.6), SHAPE).astype(np.float32)
-    still = Layers("body", FIRST, STEP_MM, (Layer("sheet", height, half_mm=0.3),), np.zeros(SHAPE, np.float32))
+    still = Layers("body", FIRST, STEP_MM, (Layer("sheet", height, half_mm=0.3),), height, height)
     _, grid = grid_of(still)
     middle = FIRST[2] + 7.6 * STEP_MM
     for above, sign in ((0.2, 1), (-0.2, -1)):
@@ -78,3 +90,29 @@ def test_unevenness_is_that_of_the_nearest_grid_point(layers):
     found = uneven_at(grown.uneven, grown.first, grown.per_mm, *place)
     assert found == pytest.approx(10 ** (layers.uneven_db[3, 4, 5] / 20), rel=1e-5)
     assert uneven_at(grown.uneven, grown.first, grown.per_mm, *(FIRST - 9)) == 1
+
+
+def test_strands_follow_strata():
+    """On tilted strata: along one the unevenness stays for millimetres, across it changes within one; its variance is 1."""
+    axes = np.meshgrid(*(STEP_MM * np.arange(n) for n in SHAPE), indexing="ij")
+    strata = (axes[2] - 0.4 * axes[0]).astype(np.float32)
+    tilted = packed(Layers("body", FIRST, STEP_MM, (Layer("whole", axes[0]),), axes[0], strata))
+    rng = np.random.default_rng(5)
+    places = FIRST + rng.uniform(2, 7, (3000, 3))
+
+    def found(aside: tuple[float, float, float]) -> np.ndarray:
+        return np.array([strand_at(tilted.strata, tilted.strands, tilted.first, tilted.per_mm, *p) for p in places + aside])
+
+    here, along, across = found((0, 0, 0)), found((0.7, 0, 0.28)), found((0, 0, 0.7))
+    assert here.std() == pytest.approx(1, abs=0.25)
+    assert np.corrcoef(here, along)[0, 1] > 0.8 and abs(np.corrcoef(here, across)[0, 1]) < 0.5
+    assert strand_at(tilted.strata, tilted.strands, tilted.first, tilted.per_mm, *(FIRST - 9)) == 0
+
+
+def test_patches_of_a_border_send_back_a_share():
+    """Some nearly all, many hardly any, and those 0.3 mm apart the same."""
+    strands, rng = grown_layers._strands(), np.random.default_rng(6)
+    places = rng.uniform(-40, 40, (4000, 3))
+    here, near, far = (np.array([patch_at(strands, *p) for p in places + aside]) for aside in (0, (0.3, 0, 0), (15, 0, 0)))
+    assert here.min() >= 0 and here.max() <= 1 and (here < 0.1).mean() > 0.15 and (here > 0.8).mean() > 0.03
+    assert np.corrcoef(here, near)[0, 1] > 0.8 and abs(np.corrcoef(here, far)[0, 1]) < 0.3

@@ -85,6 +85,20 @@ def test_smoothing_despeckling_and_edges():
     assert rise[1] < 0.75 * rise[0] and rise[2] > 0.85 * rise[0]
 
 
+def test_streaks_are_smoothed_along_themselves():
+    """A slanted thin line among grains keeps most of its height; grains beside it lose half, and none turn where none run."""
+    rng = np.random.default_rng(4)
+    row, column = np.mgrid[:120, :120] * 0.12
+    line = np.exp(-(((row - 7 - 0.3 * (column - 7)) / 0.15) ** 2)).astype(np.float32)
+    noisy = 0.3 + 0.4 * line + 0.05 * rng.standard_normal(line.shape).astype(np.float32)
+    found = processed(noisy, Picture(streaks=1.0), 0.12, 0.12)
+    on, off = line > 0.9, line < 0.01
+    assert found[on].mean() > 0.9 * noisy[on].mean() and found[on].std() < 0.75 * noisy[on].std()
+    assert found[off].std() < 0.7 * noisy[off].std()
+    level = np.full((40, 50), 0.4, np.float32)
+    np.testing.assert_allclose(processed(level, Picture(streaks=1.0), 0.12, 0.12), level, atol=1e-6)
+
+
 def test_lines_apart_are_interpolated_between():
     share = np.random.default_rng(2).random((20, 41), np.float32)
     found = processed(share, Picture(line_mm=0.5), 0.125, 0.12)
