@@ -38,7 +38,7 @@ TISSUES = {
     "polymer": Tissue(3.2, 2700.0, 1.4, None, 0.001),  # acrylic glass, nylon and their like [K]
     "sanded": Tissue(3.2, 2700.0, 1.4, None, 0.03),  # the same, sanded or under matt paint: it scatters to all sides; assumed
     "steel": Tissue(46.0, 5900.0, 0.2, None, 0.002),  # [K]
-    "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03, modulus_kpa=1e7),  # assumed, across the grain: it absorbs all
+    "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
     "skin": Tissue(
         1.72, 1555.0, 1.84, 10.0, 0.03, True, strands_db=2.0, modulus_kpa=60.0
@@ -56,7 +56,7 @@ TISSUES = {
         1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0, 5.5, modulus_kpa=10.0
     ),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
     "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0, modulus_kpa=60.0),  # as ligaments and tendons [I]; echoes assumed
-    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05, modulus_kpa=1e7),  # 1908 kg/m3, 3515 m/s, attenuation [I]
+    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05),  # 1908 kg/m3, 3515 m/s, attenuation [I]
     "lung": Tissue(0.37, 949.0, 20.0, None, 0.05),  # 394 kg/m3, 949 m/s [I]: it lets nothing back
 }
 

@@ -22,7 +22,7 @@ class Tissue:
     fibres_db: float = 0.0  # by which a layer of fibres is brighter where sound meets it squarely
     strands_db: float = 0.0  # standard deviation of the backscatter from strand to strand, where layers have grown
     specks_per_mm3: float = 0.0  # calcifications
-    modulus_kpa: float = 3.25  # Young's, at small strains
+    modulus_kpa: float = 3.25  # Young's, at small strains, of what is soft
 
     def __post_init__(self) -> None:
         if not (self.impedance > 0 and self.speed > 0):

@@ -123,7 +123,7 @@ def board(chosen: Settings, out: Path, add: bool = True) -> render.Config:
 
 def skin(chosen: Settings, out: Path) -> render.Config:
     """Settings of the scene under fringes."""
-    own = {name: getattr(chosen, name) for name in ("scene", "patterns", "cameras", "shooting", "living")}
+    own = {name: getattr(chosen, name) for name in ("scene", "patterns", "cameras", "shooting", "living", "images_hz")}
     return render.Config.model_validate(_shared(chosen) | own | {"out": out, "add": True})
 
 

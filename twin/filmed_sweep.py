@@ -97,7 +97,7 @@ class SweepSettings(LedBodies):
 
     @model_validator(mode="after")
     def _lives_on_a_surface(self) -> "SweepSettings":
-        if self.living != Living() and self.path.kind not in ("stroke", "hold"):
+        if self.living.lives and self.path.kind not in ("stroke", "hold"):
             raise ValueError(f"living: expected a path over a surface, such as stroke, found {self.path.kind}; give living=still")
         return self
 
@@ -158,6 +158,8 @@ class PlannedSweep:
         tools = [[Tool(shaft.moved(poses[k])) for shaft, poses in shafts] for k in range(len(self.plan.times))]
         poses, times = self.body_from_image, self.plan.truth.times.tolist()
         living = self.living
+        if living is not None and living.patient.living.yields:
+            assert living.patient.soft  # before threads ask for it
         field = None if living is None else (lambda k: living.field(times[k], poses[k]))
         return scans(self.scanned, self.settings.ultrasound, poses, seed, tools, field)
 
@@ -190,7 +192,7 @@ class PlannedSweep:
             quality, living = settings.frames.quality, self.living
             if living is None:
                 return shown(film_session.shoot(bank, rig, made, quality, settings.own_seed), len(made))
-            moments = (scene_frames.parts_of(living.scene_at(self.scene, time)) for time in target.times.tolist())
+            moments = (scene_frames.parts_of(living.scene_at(self.scene, time), self.scene) for time in target.times.tolist())
             return shown(film_session.shoot_moving(bank, rig, made, quality, settings.own_seed, moments), len(made))
 
         return scene_frames.SceneFilm(rig, settings.rig, settings.frames, self.plan.track.times, made, frames, stage.looks)
@@ -207,8 +209,9 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     scene = build_scene(settings.scene)
     scanned = at_speeds(body(scene), settings.conditions.sound, settings.seed)
     living = None
-    if settings.living != Living():
+    if settings.living.lives:
         living = living_body(settings.living, scanned, getattr(settings.path, "surface", ""), settings.own_seed)
+    most_mm = MOST_PRESSED_MM if settings.living.yields else GIVES_MM
     plan = sweep_session.plan_sweep(
         settings.path,
         settings.rig,
@@ -219,7 +222,7 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
         settings.own_seed,
         settings.conditions.motion,
         None if living is None else partial(living.world_from_body, share=settings.living.follows),
-        MOST_PRESSED_MM if settings.living.yields else GIVES_MM,
+        most_mm,
     )
     bodies = swept_bodies.lead(
         settings,
@@ -238,7 +241,11 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     bodies = {
         name: replace(one, track=_carried(one.track, moved), truth=_carried(one.truth, moved)) for name, one in bodies.items()
     }
-    swept = None if living is None else LivingSweep(living, settings.ultrasound, plan.target.path)
+    swept = None
+    if living is not None:
+        swept = LivingSweep(living, settings.ultrasound, plan.target.path)
+        met = replace(swept.path, poses=swept.body_from_image(swept.path.times, swept.path.poses))
+        sweep_session.refuse_inside(met, scanned, settings.ultrasound, most_mm)
     return PlannedSweep(settings, scene, scanned, plan, bodies, moved, swept)
 
 

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from recon.capture.manifest import SCANNER, sweep_part
+from recon.capture.manifest import MANIFEST, SCANNER, sweep_part
+from recon.errors import InputError
 from scenes.catalogue import parse_scene
 from twin.engine import Engine, results
 from twin.filmed_sweep import SweepSettings, plan_sweep
@@ -23,7 +24,7 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
     for number in range(count):
         one = _session(out, settings, number)
         path = one.truth.folder / SETTINGS
-        if not path.is_file() or read_json(path) != one.settings:
+        if not path.is_file() or not (one.capture / MANIFEST).is_file() or read_json(path) != one.settings:
             one.check()
             found.append(number)
     return found
@@ -36,7 +37,10 @@ def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine)
 
 def write(out: Path, settings: SweepSettings, number: int) -> int:
     """Render the sweep of a number, and write it with its truth; gives its B-scans."""
-    planned = plan_sweep(numbered(settings, number))
+    try:
+        planned = plan_sweep(numbered(settings, number))
+    except InputError as error:
+        raise InputError(f"sweep {number:06d}: {error}") from None
     chosen = planned.settings
     known = sweep_session.PURPOSES[chosen.path.kind] != "probe"
     sweep_session.write_session(
@@ -50,6 +54,7 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
         None,
         planned.bodies,
         planned.truth if planned.living else None,
+        planned.body_from_image,
     )
     return len(planned.plan.times)
 
@@ -65,4 +70,5 @@ def numbered(settings: SweepSettings, number: int) -> SweepSettings:
 def _session(out: Path, settings: SweepSettings, number: int) -> Session:
     chosen = numbered(settings, number)
     name = f"{number:06d}"
-    return Session(out / name, sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,))
+    purpose = sweep_session.PURPOSES[chosen.path.kind] if chosen.name else None
+    return Session(out / name, sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,), purpose=purpose)

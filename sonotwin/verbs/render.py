@@ -89,7 +89,7 @@ class Config(LedBodies):
     def _fits_poses(self) -> "Config":
         if self.poses is None:
             return self
-        if self.living != STILL:
+        if self.living.lives:
             raise ValueError("living: expected none of it with poses of a board, found some; give living=still")
         if self.scene.get("kind") != "board":
             raise ValueError(f"poses: expected scene=board with them, found scene.kind {self.scene.get('kind')}")
@@ -180,7 +180,7 @@ def render_surface(config: Config, session: Session, console: Console) -> None:
     session.check()
     rig, scene, standing = set_up(config)
     views, moments = {}, []
-    if config.living != STILL:
+    if config.living.lives:
         with console.status("moving the scene"):
             times = np.rint(np.arange(config.patterns.count) * 1e9 / config.images_hz).astype(np.int64)
             moments = scenes_at(scene, living_body(config.living, body(build_scene(config.scene)), "", config.seed), times)

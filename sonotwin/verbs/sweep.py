@@ -13,7 +13,7 @@ bodies of the rig, too. With `moved` the patient, the scene and all over it, has
 
 With `living=patient` she breathes, her heart beats, and soft tissue yields to the probe; her position at rest, at the end of an
 expiration, is that of the fringes. OUT/truth then also holds living.npz: where chest and masses were at each image, and where
-the points that its pixels show rest.
+the points that its pixels show rest. Elasticity takes half a minute to set up and some GB of memory, for each worker.
 
 With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds `seed`, `seed`+1 and so on, each of another
 patient. A run that was stopped goes on where it was; any engine gives the same bytes.
@@ -122,6 +122,7 @@ def run(config: Config) -> None:
         film,
         planned.bodies,
         planned.truth if planned.living else None,
+        planned.body_from_image,
     )
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size
@@ -167,7 +168,7 @@ def places(planned: PlannedSweep) -> Iterator[tuple[str, bool]]:
     rig, filmed = planned.settings.rig, planned.settings.filmed
     before = [(PROBE, rig.target, planned.world_from_reference @ planned.plan.target.poses())]
     for name, body in planned.bodies.items():
-        viewed, tip = body.in_view(rig), body.in_slice(planned.plan.truth.poses, rig)
+        viewed, tip = body.in_view(rig), body.in_slice(planned.body_from_image, rig)
         line = f"{name:<11} target in view of both cameras at {viewed.sum()} of {len(viewed)} poses"
         if tip is not None:
             line += f"; tip in the slice in {tip.sum()} of {len(tip)} B-scans"

@@ -52,7 +52,7 @@ def patient(seed: int) -> dict:
     wanted = int(rng.integers(2, 4))
     for _ in range(200):
         if len(masses) == wanted:
-            return scene | {"masses": masses}
+            break
         size, form = float(rng.uniform(8, 20)), str(rng.choice(FORMS))
         centre = rng.uniform([-38, -26, 14], [38, 26, 38])
         pattern = "anechoic" if form == "round" else str(rng.choice(PATTERNS if form in CIRCUMSCRIBED else ("hypoechoic",)))
@@ -65,7 +65,9 @@ def patient(seed: int) -> dict:
         except InputError:  # too near to skin or chest
             continue
         masses.append(one)
-    raise InputError(f"patient {seed}: expected room for {wanted} masses, found none")
+    if len(masses) < wanted:
+        raise InputError(f"patient {seed}: expected room for {wanted} masses, found it for {len(masses)}")
+    return scene | {"masses": masses}
 
 
 def measure(settings: Settings, seed: int) -> Metrics:

@@ -14,7 +14,7 @@ Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wrig
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from threading import Lock
+from threading import RLock
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +38,10 @@ LAYERS = (0.04, 0.06, 0.08, 0.11, 0.15, 0.18, 0.19, 0.19)  # heights of a column
 BESIDE_MM = 15.0  # of the mesh beside a body that lies on a soft support
 HELD_MM = 10.0  # below a soft support's surface, where bone holds it; assumed
 LEAST_MM = 3.0  # of a column; lower ones are left out
+HARD_KPA = 1e7  # of what isn't soft
+REACH_MM = 20.0  # along the normal, within which the skin under a point of the face is looked for
+NEAR_MM = 3.0  # of the skin, from where a point of the face may touch it
+FRICTION = 0.5  # of wet skin on the face, over the pressure; assumed
 POISSON = 0.495  # of soft tissue: nearly incompressible
 STIFFEST = 40.0  # times the softest: stiffer tissues, which don't yield beside it, count as much
 GRID_MM = 2.5  # of the grid that displacements are kept on
@@ -114,7 +118,7 @@ class ElasticBody:
     coupling: sparse.csr_matrix  # (m, k) stiffness between these and those of the base
     held: NDArray[np.int64]  # (k,) numbers of the base's degrees of freedom
     responses: dict[int, NDArray[np.float32]] = field(default_factory=dict)  # (3 n, 3) by node of the skin, mm for each force
-    lock: Lock = field(default_factory=Lock)  # of the responses
+    lock: RLock = field(default_factory=RLock)  # of the responses, and of all threads of linear algebra
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -143,7 +147,8 @@ class ElasticBody:
         every = np.zeros((*self.size, 3))
         every[:, :, -1] = shifts
         flat = every.reshape(-1)
-        flat[self.free] = self.factor.solve(-(self.coupling @ flat[self.held])[:, None])[:, 0]
+        with self.lock:
+            flat[self.free] = self.factor.solve(-(self.coupling @ flat[self.held])[:, None])[:, 0]
         return every
 
 
@@ -183,28 +188,36 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
     """
     base = np.zeros((*soft.size, 3)) if already is None else already
     under = _under(soft, face, normal)
+    if not (under.depth > -NEAR_MM).any():
+        return led_through(spread(soft, base))
+    face = face[under.depth > -NEAR_MM]
+    under = _Under(*(values[under.depth > -NEAR_MM] for values in under))
     nodes, at = np.unique(under.nodes, return_inverse=True)
-    soft.respond(nodes)
     share = np.zeros((len(face), len(nodes)))
     np.add.at(share, (np.repeat(np.arange(len(face)), 4), at.ravel()), under.weights.ravel())
-    surface = 3 * soft.size[2] * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))
-    compliance = np.stack([soft.responses[node][surface] for node in nodes.tolist()], axis=1)  # (3 k, k, 3)
-    compliance = compliance.astype(float).reshape(len(nodes), 3, len(nodes), 3)
-    skin = np.einsum("ma,aibj,nb->minj", share, compliance, share, optimize=True)  # (m, 3, m, 3) at points by forces on others
-    pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
-    pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
-    root = np.linalg.cholesky(pushed)
     rested = face - under.depth[:, None] * normal
     wanted = under.depth - (share @ base[:, :, 0].reshape(-1, 3)[nodes]) @ normal
+    with soft.lock, threadpool_limits(1):
+        soft.respond(nodes)
+        surface = 3 * soft.size[2] * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))
+        compliance = np.stack([soft.responses[node][surface] for node in nodes.tolist()], axis=1)  # (3 k, k, 3)
+        compliance = compliance.astype(float).reshape(len(nodes), 3, len(nodes), 3)
+        skin = np.einsum(
+            "ma,aibj,nb->minj", share, compliance, share, optimize=True
+        )  # (m, 3, m, 3) at points by forces on others
+        pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
+        pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
+        root = np.linalg.cholesky(pushed)
     for _ in range(2):  # large displacements leave some of the depth
-        force, _ = nnls(root.T, np.linalg.solve(root, wanted))
-        forces = force[:, None] * normal
-        if drag is not None and force.any():
-            forces += _dragging(skin, forces, force > 0, normal, drag)
-        moved = base.reshape(-1).copy()
-        for node, push in zip(nodes.tolist(), share.T @ forces, strict=True):
-            if push.any():
-                moved += soft.responses[node] @ push.astype(np.float32)
+        with soft.lock, threadpool_limits(1):
+            force, _ = nnls(root.T, np.linalg.solve(root, wanted))
+            forces = force[:, None] * normal
+            if drag is not None and force.any():
+                forces += _dragging(skin, forces, force > 0, normal, drag)
+            moved = base.reshape(-1).copy()
+            for node, push in zip(nodes.tolist(), share.T @ forces, strict=True):
+                if push.any():
+                    moved += soft.responses[node] @ push.astype(np.float32)
         found = led_through(spread(soft, moved.reshape(base.shape)))
         wanted = wanted + np.where(force > 0, ((face - moved_to(found, rested)) @ normal), 0)
     return found
@@ -219,18 +232,32 @@ class _Under(NamedTuple):
 
 
 def _under(soft: ElasticBody, face: Array, normal: Array) -> _Under:
-    """The resting skin under each point of a face, along its normal."""
-    mesh = soft.mesh
-    depth = np.zeros(len(face))
-    for _ in range(6):  # the skin is a height over x and y, the normal is oblique
-        place = face - depth[:, None] * normal
-        i, a = _between(place[:, 0], mesh.x)
-        j, b = _between(place[:, 1], mesh.y)
-        weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], axis=1)
-        nodes = np.stack([i, i, i + 1, i + 1], axis=1) * len(mesh.y) + np.stack([j, j + 1, j, j + 1], axis=1)
-        height = (weights * mesh.skin.ravel()[nodes]).sum(axis=1)
-        depth += (place[:, 2] - height) / normal[2]
-    return _Under(nodes, weights, depth)
+    """The resting skin under each point of a face, along its normal: the nearest; far from any the depth is -inf."""
+    mesh, steps = soft.mesh, np.arange(-REACH_MM, REACH_MM + 0.2, 0.2)
+
+    def within(depth: Array) -> tuple[Array, NDArray[np.int64], Array]:
+        """How far a place at a depth below the skin lies within the tissue, down the world's z, and the nodes about it."""
+        place = face.reshape(-1, *(1,) * (depth.ndim - 1), 3) - depth[..., None] * normal
+        i, a = _between(place[..., 0], mesh.x)
+        j, b = _between(place[..., 1], mesh.y)
+        weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b], axis=-1)
+        nodes = np.stack([i, i, i + 1, i + 1], axis=-1) * len(mesh.y) + np.stack([j, j + 1, j, j + 1], axis=-1)
+        skin = (weights * mesh.skin.ravel()[nodes]).sum(axis=-1)
+        beside = ~mesh.kept[i, j]
+        for axis, line in enumerate((mesh.x, mesh.y)):
+            beside |= (place[..., axis] < line[0]) | (place[..., axis] > line[-1])
+        return np.where(beside, -np.inf, place[..., 2] - skin), nodes, weights
+
+    inside = within(np.broadcast_to(steps, (len(face), len(steps))))[0]
+    leaves = (inside[:, :-1] >= 0) & (inside[:, 1:] < 0) & np.isfinite(inside[:, 1:])  # from tissue outwards
+    nearest = np.where(leaves, np.abs(steps[:-1]), np.inf).argmin(axis=1)
+    low, high = steps[nearest], steps[nearest + 1]
+    for _ in range(20):
+        middle = (low + high) / 2
+        held = within(middle)[0] >= 0
+        low, high = np.where(held, middle, low), np.where(held, high, middle)
+    _, nodes, weights = within(low)
+    return _Under(nodes, weights, np.where(leaves.any(axis=1), low, -np.inf))
 
 
 def _between(values: Array, nodes: Array) -> tuple[NDArray[np.int64], Array]:
@@ -241,7 +268,7 @@ def _between(values: Array, nodes: Array) -> tuple[NDArray[np.int64], Array]:
 
 
 def _dragging(skin: Array, pushing: Array, touching: NDArray[np.bool_], normal: Array, drag: Array) -> Array:
-    """Forces : (m, 3) by which points that touch the skin draw it along, square to the normal."""
+    """Forces : (m, 3) by which points that touch the skin draw it along, square to the normal, as far as friction holds it."""
     across = np.linalg.svd(normal[None])[2][1:]  # (2, 3)
     some = np.flatnonzero(touching)
     wanted = np.tile(across @ drag, (len(some), 1)) - np.einsum("ki,minj,nj->mk", across, skin[some], pushing)
@@ -250,7 +277,8 @@ def _dragging(skin: Array, pushing: Array, touching: NDArray[np.bool_], normal: 
     matrix += 1e-6 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
     forces = np.zeros_like(pushing)
     forces[some] = np.linalg.solve(matrix, wanted.ravel()).reshape(-1, 2) @ across
-    return forces
+    most, found = FRICTION * np.linalg.norm(pushing.sum(axis=0)), np.linalg.norm(forces.sum(axis=0))
+    return forces * min(1.0, most / max(found, 1e-12))
 
 
 def _mesh(surface: Solid, support: Solid | None, element_mm: float) -> Mesh:
@@ -274,7 +302,7 @@ def _mesh(surface: Solid, support: Solid | None, element_mm: float) -> Mesh:
 
 def _moduli(body: Body, mesh: Mesh) -> Array:
     """Young's modulus, kPa, of all elements : (nx - 1, ny - 1, nz - 1): the mean of the tissues at some of its points."""
-    soft = [tissue.modulus_kpa for tissue in body.tissues]
+    soft = [tissue.modulus_kpa if tissue.soft else HARD_KPA for tissue in body.tissues]
     nodes = mesh.nodes()
     inside = [(np.arange(n) + 0.5) / n for n in SAMPLES]
     shares = np.stack(np.meshgrid(*inside, indexing="ij"), axis=-1).reshape(-1, 3)

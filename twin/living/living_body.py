@@ -18,12 +18,13 @@ import trimesh
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model import tracks
 from recon.model.rig import Fraction, Part, Positive, Vector
 from recon.model.tracks import Track
 from scenes.scene_types import Scene
-from twin.displacement import NOWHERE, Displacement, led_through, moved_to, rested_at
+from twin.displacement import LEAST_STRETCH, NOWHERE, Displacement, led_through, moved_to, rested_at
 from twin.living import elastic_body
 from twin.living.elastic_body import ElasticBody
 from twin.ultrasound.echo_solids import Body, Solid
@@ -41,7 +42,6 @@ FOOT_POINTS = (17, 7)  # of it, along and across, that may touch the skin
 BEATING_MM = 35.0  # standard deviation of the place over which the chest's wall beats; assumed
 PULSE = 0.12  # of a beat, over which the wall goes out and comes back; assumed
 STRIDE = 8  # pixels, of the truth that is kept
-SHOWN = ("breast", *SUPPORTS)  # solids that aren't hidden in one
 SHIFT_S = 1.0  # in which a patient shifts; assumed
 
 
@@ -55,7 +55,7 @@ class Living(Part):
     breathing_mm: Annotated[float, Field(ge=0, le=50)] = 0.0
     """mm, by which the chest rises towards the cameras from the end of an expiration on"""
     breathing_deg: Annotated[float, Field(ge=-20, le=20)] = 0.0
-    """deg, by which it tilts meanwhile, about the world's x"""
+    """deg, by which it tilts meanwhile, about a line along the world's x at the body's lower end"""
     breathing_s: Positive = 4.0
     """s, a breath"""
     heartbeat_mm: Annotated[float, Field(ge=0, le=5)] = 0.0
@@ -72,9 +72,10 @@ class Living(Part):
     """share of the chest's motion that the hand which leads the probe goes along with"""
 
     @property
-    def moves(self) -> bool:
-        """Whether the chest moves as one."""
-        return bool(self.breathing_mm or self.breathing_deg or any(self.shift_mm) or any(self.turn_deg))
+    def lives(self) -> bool:
+        """Whether anything moves or yields."""
+        moves = self.breathing_mm or self.breathing_deg or any(self.shift_mm) or any(self.turn_deg)
+        return bool(self.yields or self.heartbeat_mm or moves)
 
 
 STILL = Living()
@@ -82,7 +83,7 @@ STILL = Living()
 
 def breath(time_s: Array, period_s: float, phase: float) -> Array:
     """Depth of a breath at times, 0 at the end of an expiration and 1 at that of an inspiration [Lujan et al. 1999, n = 2]."""
-    return 1 - np.cos(np.pi * (np.asarray(time_s) / period_s + phase)) ** 4
+    return np.sin(np.pi * (np.asarray(time_s) / period_s + phase)) ** 4
 
 
 def pulse(time_s: Array, period_s: float, phase: float) -> Array:
@@ -159,7 +160,13 @@ class LivingSweep:
         if not self.patient.living.yields:
             return self.patient.field(time)
         face, normal = _foot(self.transducer, body_from_image)
-        return elastic_body.press(self.patient.soft, face, normal, self.patient.beaten(time), self._drag_at(time, normal))
+        found = elastic_body.press(self.patient.soft, face, normal, self.patient.beaten(time), self._drag_at(time, normal))
+        if found.stretch <= LEAST_STRETCH:
+            raise InputError(
+                f"path.standoff_mm: expected pressure that shrinks no length to less than {LEAST_STRETCH:g} of it, found more "
+                f"after {time * 1e-9:.2f} s; press less, or choose another place"
+            )
+        return found
 
     def scene_at(self, scene: Scene, time: int) -> Scene:
         """The scene at a moment, ns, as cameras see it under the probe."""
@@ -174,9 +181,11 @@ class LivingSweep:
         -------
         dict
             world_from_body (n, 4, 4) mm; rested_mm (n, h, w, 3): where in the body each STRIDE-th pixel rests, by its true depth;
-            centres_mm (n, k, 3): in the world, of what is hidden in the body, and resting_centres_mm (k, 3) in the body.
+            centres_mm (n, k, 3): in the world, of what is hidden; resting_centres_mm (k, 3) in the body, and names (k,).
         """
-        hidden = [one.mesh for one in self.patient.body.solids if not one.is_layer and one.name not in SHOWN]
+        inner = [one for one in self.patient.body.solids if not one.is_layer and one.name not in SUPPORTS]
+        inner = [one for one in inner if one is not self.patient.surface]
+        hidden = [one.mesh for one in inner]
         poses, motion = self.body_from_image(times, world_from_image), self.patient.world_from_body(times)
         width, height = self.transducer.image_size
         sx, sy = self.transducer.scale_mm_per_px
@@ -189,7 +198,9 @@ class LivingSweep:
             centres.append([moved_mesh(mesh, carried, field).center_mass for mesh in hidden])
         resting = np.array([mesh.center_mass for mesh in hidden]).reshape(-1, 3)
         shapes = np.array(centres).reshape(len(times), len(hidden), 3)
-        return {"world_from_body": motion, "rested_mm": np.array(rested), "centres_mm": shapes, "resting_centres_mm": resting}
+        return {"world_from_body": motion, "rested_mm": np.array(rested), "centres_mm": shapes, "resting_centres_mm": resting} | {
+            "names": np.array([one.name for one in inner])
+        }
 
     def _drag_at(self, time: int, normal: Array) -> Array | None:
         if not self.patient.living.drag_mm:
@@ -209,7 +220,8 @@ class LivingSweep:
         steps -= poses[:, :3, 1] * (steps * poses[:, :3, 1]).sum(axis=1, keepdims=True)
         drags, drawn = np.zeros_like(steps), np.zeros(3)
         for n, step in enumerate(np.nan_to_num(steps)):
-            drawn = drawn * np.exp(-np.linalg.norm(step) / self.patient.living.drag_mm) + step
+            way = float(np.linalg.norm(step)) / self.patient.living.drag_mm
+            drawn = drawn * np.exp(-way) + step * (-np.expm1(-way) / max(way, 1e-12))
             drags[n] = drawn
         return drags
 
@@ -220,10 +232,13 @@ def living_body(living: Living, body: Body, surface: str, seed: int) -> LivingBo
     Raises
     ------
     InputError
-        If the scene has no solid that may live; see `surface_of`.
+        If the scene has no solid that may live, see `surface_of`, or a hard one is to yield.
     """
+    solid = surface_of(surface, body)
+    if living.yields and not solid.tissue.soft:
+        raise InputError(f"living.yields: expected a surface of soft tissue, found {solid.name}; give living.yields=false")
     phases = np.random.default_rng([seed, STREAM]).uniform(size=2)
-    return LivingBody(living, body, surface_of(surface, body), (float(phases[0]), float(phases[1])))
+    return LivingBody(living, body, solid, (float(phases[0]), float(phases[1])))
 
 
 def scenes_at(scene: Scene, patient: LivingBody, times: Moments) -> list[Scene]:

@@ -79,7 +79,7 @@ def shoot(
     light_seed, sensor_seed = np.random.SeedSequence([seed, ("cam1", "cam2").index(camera)]).generate_state(2).tolist()
     optics = camera_optics(rig, camera)
     scene = as_skin(scene, conditions.skin, seed)
-    world, projector = build_world(scene), ProjectorOptics.of(rig.projector)
+    world, projector = build_world(moments[0] if moments else scene), ProjectorOptics.of(rig.projector)
     frames = draw(conditions.frames, patterns.count, seed)
     light = emitted(patterns, rig.projector, frames)
     spreading = translucent(scene, world)

@@ -113,10 +113,10 @@ def _in_a_hand(body: Sequence[Part]) -> bool:
     return any(part.slot == "skin" for part in body)
 
 
-def parts_of(scene: Scene) -> list[Part]:
-    """Things that cameras see, with their own reflectances, on a bench."""
+def parts_of(scene: Scene, resting: Scene | None = None) -> list[Part]:
+    """Things that cameras see, with their own reflectances, on a bench: below where they rest, if they have moved."""
     seen = [thing for thing in scene.things if not thing.inside]
-    depth = max(float(thing.mesh.bounds[1, 2]) for thing in seen)
+    depth = max(float(thing.mesh.bounds[1, 2]) for thing in (resting or scene).things if not thing.inside)
     bench = lofts.box([BENCH_MM, BENCH_MM, 40], [0, 0, depth + FLOAT_MM + 20])
     return [*(_part_of(thing) for thing in seen), Part("bench", bench, False)]
 

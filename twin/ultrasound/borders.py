@@ -111,7 +111,7 @@ def _borders_near(clear, side, solids, point, t, radius_mm):
         elif clear[solid] < t + GROWTH_MM:
             d = shrinking(solids) * resting_distance(solids, solid, x, y, z)
             side[solid] = NEAR if abs(d) <= radius_mm + GROWTH_MM else INSIDE if d < 0 else OUTSIDE
-            clear[solid] = t + (GROWTH_MM if side[solid] == NEAR else min(abs(d) - radius_mm, LEAP_MM))
+            clear[solid] = t + (GROWTH_MM if side[solid] == NEAR else min(abs(d) - radius_mm, shrinking(solids) * LEAP_MM))
         met |= side[solid] == NEAR
         free = min(free, clear[solid])
     return met, free

@@ -131,7 +131,7 @@ def table_at(table, line, depth, step_mm):
 @njit(inline="always")
 def _nearest(solids, x, y, z):
     """Distance to the nearest border, LEAP_MM at most."""
-    near = LEAP_MM
+    near = shrinking(solids) * LEAP_MM
     x, y, z = resting_place(solids, x, y, z)
     for solid in range(len(solids.grid)):
         near = min(near, shrinking(solids) * abs(resting_distance(solids, solid, x, y, z)))

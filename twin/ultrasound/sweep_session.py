@@ -91,27 +91,27 @@ def plan_sweep(
         case SurfacePath():
             course = along_surface(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer, gives_mm)
+            refuse_inside(course, body, transducer, gives_mm)
         case Hold():
             course = resting(path, surface_of(path.surface, body), transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer, gives_mm)
+            refuse_inside(course, body, transducer, gives_mm)
         case Bob():
             course = bobbing(path, transducer, path_seed, shaken)
             taken = moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer)
+            refuse_inside(course, body, transducer)
         case WirePath():
             course, rests = about_crossing(path, body, transducer, path_seed)
             taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer)
+            refuse_inside(course, body, transducer)
         case RowPath():
             course, rests = over_rows(path, body, transducer, path_seed)
             taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer)
+            refuse_inside(course, body, transducer)
         case TiltPath():
             course, rests = over_surface(path, body, transducer, path_seed)
             taken = rests if path.rest_s else moments(course, clocks.scanner_hz)
-            _refuse_inside(course, body, transducer)
+            refuse_inside(course, body, transducer)
     if carried is not None:
         course = replace(course, poses=carried(course.times) @ course.poses)
     return plan(rig.probe, course, taken, clocks, noise, clock_seed, errors)
@@ -140,7 +140,7 @@ def surface_of(name: str, body: Body) -> Solid:
     return others[0]
 
 
-def _refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm: float = 0.0) -> None:
+def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm: float = 0.0) -> None:
     """Refuse a course on which the array's face gets into a solid, by more than is allowed.
 
     Raises
@@ -224,6 +224,7 @@ def write_session(
     film: FilmPart | None = None,
     bodies: Mapping[str, TrackedBody] = MappingProxyType({}),
     living: Callable[[], Mapping[str, Array]] | None = None,
+    reference_from_image: Array | None = None,
 ) -> None:
     """Write a sweep and its truth, taking the scans one by one, and then the frames.
 
@@ -233,6 +234,7 @@ def write_session(
     film : of the cameras, in which the poses are then still to be found; None where the poses are given.
     bodies : further ones, by name
     living : truth of a body that lives, worked out when the images are written
+    reference_from_image : (n, 4, 4) mm, where its images are in its own frame; else as in the world
     """
     with session.write(_describe_sound(scene, body)) as (capture, truth):
         own = truth.own.relative_to(truth.folder)
@@ -241,13 +243,14 @@ def write_session(
         if living is not None:
             truth.write_arrays(str(own / LIVING), living())
 
+        met = planned.truth.poses if reference_from_image is None else reference_from_image
         shown: dict[str, list[dict[str, NDArray]]] = {one: [] for one in bodies}
 
         def images() -> Iterator[tuple[str, NDArray[np.uint8]]]:
             for number, one in enumerate(scans):
                 for further, led in bodies.items():
                     if led.shaft is not None:
-                        shaft, pose = led.shaft.moved(led.scanned.poses[number]), planned.truth.poses[number]
+                        shaft, pose = led.shaft.moved(led.scanned.poses[number]), met[number]
                         shown[further].append(tool_truth.placed(shaft, transducer, one.paths, pose))
                 labels = bscan_truth.labels(one.paths, transducer)
                 write_images([truth.own / LABELS / image_name(number)], labels[None])
