@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from recon.geometry import rigid
 from scenes.anatomy import GLANDULAR
 from scenes.catalogue import build_scene
+from twin.living.living_body import Living, LivingBody, LivingSweep
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import body
 from twin.ultrasound.probe_path import Hand, Hold, resting
@@ -55,13 +56,15 @@ def _bscans() -> dict[str, NDArray[np.uint8]]:
 
 
 def _patients(scanner: Path) -> dict[str, NDArray[np.uint8]]:
-    """B-scans of breasts of all densities, and of masses, by title, as a scanner shows them."""
+    """B-scans of breasts of all densities, and of masses, by title, as a scanner shows them that is pressed in by 4 mm."""
     array, images = Transducer(**yaml.safe_load(scanner.read_text(encoding="utf-8"))), {}
     for seed, density in enumerate(GLANDULAR):
         breast = body(build_scene({"kind": "patient", "seed": 7 + seed, "anatomy": {"density": density}}))
+        patient = LivingBody(Living(yields=True), breast, surface_of("breast", breast), (0.0, 0.0), element_mm=5.0)
         for title, (x, y) in PATIENTS[density].items():
-            pose = resting(Hold(place_mm=(x, y), hand=STILL), surface_of("breast", breast), array, 1).poses[0]
-            images[f"{density}, {title}"] = scan(breast, array, pose, 7 + seed).image
+            held = resting(Hold(place_mm=(x, y), hand=STILL, standoff_mm=-4.0), patient.surface, array, 1)
+            field = LivingSweep(patient, array, held).field(0, held.poses[0])
+            images[f"{density}, {title}"] = scan(breast.displaced(field), array, held.poses[0], 7 + seed).image
     return images
 
 
