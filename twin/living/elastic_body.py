@@ -15,7 +15,7 @@ Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wrig
 from dataclasses import dataclass, field
 from itertools import pairwise
 from threading import RLock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,15 +78,15 @@ class PlaneFactor:
     before: list[Array]  # (p,) C = A L'^-T of the coupling A with the plane before, whose triangle is L'; empty of the first
 
     @classmethod
-    def of(cls, stiffness: sparse.csr_matrix, ends: NDArray[np.int64]) -> "PlaneFactor":
-        """Factorise, on one thread, for the same bits anywhere."""
+    def of(cls, stiffness: Any, ends: NDArray[np.int64]) -> "PlaneFactor":
+        """Factorise a sparse matrix, on one thread, for the same bits anywhere."""
         own, before = list[Array](), list[Array]()
         with threadpool_limits(1):
             for k, (first, end) in enumerate(pairwise(ends.tolist())):
                 block, coupling = stiffness[first:end, first:end].toarray(), np.zeros((end - first, 0))
                 if k:
-                    coupling = stiffness[first:end, ends[k - 1] : first].toarray()
-                    coupling = solve_triangular(own[-1], coupling.T, lower=True, check_finite=False).T
+                    with_before = stiffness[ends[k - 1] : first, first:end].toarray()
+                    coupling = np.transpose(solve_triangular(own[-1], with_before, lower=True, check_finite=False))
                     block -= coupling @ coupling.T
                 own.append(np.tril(cholesky(block, lower=True, overwrite_a=True, check_finite=False)))
                 before.append(np.ascontiguousarray(coupling))
@@ -159,7 +159,7 @@ def elastic_body(body: Body, surface: Solid, support: Solid | None, element_mm: 
     """
     mesh = _mesh(surface, support, element_mm)
     modulus = _moduli(body, mesh)
-    stiffness = _stiffness(mesh, modulus)
+    stiffness: Any = _stiffness(mesh, modulus)  # SciPy's own hints say that a sparse matrix has no parts
     number = np.arange(stiffness.shape[0]).reshape(*mesh.skin.shape, -1)
     held = number[:, :, -3:].ravel()
     used = np.zeros(mesh.skin.shape, bool)
@@ -359,9 +359,10 @@ def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
     whole, middle = (skfem.Basis(hexes, element, intorder=order) for order in (2, 1))
     each = {basis: shear[:, None] * np.ones((1, basis.dx.shape[1])) for basis in (whole, middle)}
     bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))
-    matrix = deviatoric.assemble(whole, shear=each[whole]) + volumetric.assemble(middle, bulk=bulk * each[middle])
+    matrix: Any = deviatoric.assemble(whole, shear=each[whole]) + volumetric.assemble(middle, bulk=bulk * each[middle])
     places = np.empty(matrix.shape[0], np.int64)
-    places[whole.nodal_dofs.T.ravel()] = (3 * used[:, None] + np.arange(3)).ravel()
+    numbers: Any = whole.nodal_dofs
+    places[numbers.T.ravel()] = (3 * used[:, None] + np.arange(3)).ravel()
     found = matrix.tocoo()
     size = 3 * number.size
     return sparse.csr_matrix((found.data, (places[found.row], places[found.col])), (size, size))

@@ -211,7 +211,7 @@ def most_rays(quality: FilmQuality) -> int:
     return max(TILE**2 * quality.view, quality.disc, quality.rim, quality.outline)
 
 
-def visible_shares(lanes: Lanes, light: Light, count: int) -> Array:
+def visible_shares(lanes: Lanes | Pixels, light: Light, count: int) -> Array:
     """Uncovered share of each disc's area within the image : (n,), by `circle_number` up to a number of them."""
     of_one = lanes.circle != NO_CIRCLE
     seen, disc = (np.bincount(lanes.circle[of_one], (part / lanes.samples)[of_one], count) for part in (light.seen, light.disc))

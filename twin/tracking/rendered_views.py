@@ -283,15 +283,11 @@ def _rendered(
             seen, known = iter(pieces[at + 1 : at + 1 + count]), {}
             for (name, truth), those in zip(shot.truth.items(), origins[2 * i + camera], strict=True):
                 its = list(islice(seen, len(those)))
+                rays, arrived = (sum(float(part[piece].sum()) for piece in its) for part in (light.white, light.white_radiance))
                 known[name] = replace(
                     truth,
                     visible=_visible(light, its) * inside_share(truth.ellipses, device.optics.size),
-                    white_dn=_white(
-                        *(sum(float(part[piece].sum()) for piece in its) for part in (light.white, light.white_radiance)),
-                        take,
-                        device,
-                        rig,
-                    ),
+                    white_dn=_white(rays, arrived, take, device, rig),
                     patch_origins=those,
                 )
             told.append(known)

@@ -152,8 +152,8 @@ class Body:
         loss = self.column("attenuation") * frequency_mhz * np.log(10) / 100  # from dB/cm/MHz
         fibres = self.column("fibres_db") * np.log(10) / 20
         strands = self.column("strands_db") * np.log(10) / 20
-        figures = (self.column(name) for name in ("impedance", "speed"))
-        return Tissues(*figures, loss, self.column("roughness"), fibres, self.column("specks_per_mm3"), strands)
+        impedance, speed, roughness, specks = map(self.column, ("impedance", "speed", "roughness", "specks_per_mm3"))
+        return Tissues(impedance, speed, loss, roughness, fibres, specks, strands)
 
     def column(self, name: str) -> Array:
         """A figure of the tissues by label : (n + 1,)."""
