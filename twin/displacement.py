@@ -119,6 +119,16 @@ def _vector(v, first, per_mm, x, y, z):
     return u, w, t
 
 
+@njit(inline="always")
+def _stepped(moved, first, per_mm, point, rested, steps):
+    """Where a point rested, by steps from a place on."""
+    rx, ry, rz = rested
+    for _ in range(steps):
+        u, v, w = _vector(moved, first, per_mm, rx, ry, rz)
+        rx, ry, rz = point[0] - u, point[1] - v, point[2] - w
+    return rx, ry, rz
+
+
 @kernel
 def carried_along(moved, first, per_mm, x, y, z):
     """Where a point lies that rests at a place."""
@@ -130,11 +140,7 @@ def carried_along(moved, first, per_mm, x, y, z):
 def carried_back(moved, back, first, per_mm, x, y, z):
     """Where a point rested that lies at a place."""
     u, v, w = _vector(back, first, per_mm, x, y, z)
-    rx, ry, rz = x + u, y + v, z + w
-    for _ in range(STEPS):
-        u, v, w = _vector(moved, first, per_mm, rx, ry, rz)
-        rx, ry, rz = x - u, y - v, z - w
-    return rx, ry, rz
+    return _stepped(moved, first, per_mm, (x, y, z), (x + u, y + v, z + w), STEPS)
 
 
 @kernel
@@ -167,8 +173,5 @@ def _carry(first, end, found, points, field, steps):
             found[n, 0], found[n, 1], found[n, 2] = x + u, y + v, z + w
         else:
             u, v, w = _vector(field.back, field.first, field.per_mm, x, y, z)
-            rx, ry, rz = x + u, y + v, z + w
-            for _ in range(steps):
-                u, v, w = _vector(field.moved, field.first, field.per_mm, rx, ry, rz)
-                rx, ry, rz = x - u, y - v, z - w
-            found[n, 0], found[n, 1], found[n, 2] = rx, ry, rz
+            rested = _stepped(field.moved, field.first, field.per_mm, (x, y, z), (x + u, y + v, z + w), steps)
+            found[n, 0], found[n, 1], found[n, 2] = rested

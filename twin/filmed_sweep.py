@@ -19,6 +19,7 @@ from twin import swept_bodies
 from twin.conditions import Conditions, in_use
 from twin.displacement import NOWHERE, Displacement
 from twin.living.living_body import Living, LivingBody, LivingSweep, living_body
+from twin.session import Session
 from twin.shooting import FrameShooting
 from twin.swept_bodies import SweptBody
 from twin.tracking.led_bodies import LedBodies, check_names
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from twin.tracking.scene_frames import SceneFilm
 
 Array = NDArray[np.float64]
-GIVES_MM, MOST_PRESSED_MM = 5.0, 15.0  # by which the face may get into a solid: one that keeps its form, and one that yields
+MOST_PRESSED_MM = 15.0  # by which the face may get into a solid that yields
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
 
 
@@ -151,6 +152,24 @@ class PlannedSweep:
         assert self.living is not None
         return self.living.truth(self.plan.truth.times, self.plan.truth.poses)
 
+    def write(self, session: Session, taken: Iterable[Scan], film: "SceneFilm | None" = None) -> None:
+        """Write the sweep and its truth, taking the B-scans, of `scans`, one by one, and then the frames."""
+        settings = self.settings
+        known = sweep_session.PURPOSES[settings.path.kind] != "probe"  # else the probe is still to be calibrated by it
+        sweep_session.write_session(
+            session,
+            self.scene,
+            self.scanned,
+            settings.ultrasound,
+            self.plan,
+            taken,
+            sweep_session.calibration_of(settings.rig, settings.ultrasound) if known else None,
+            film,
+            self.bodies,
+            self.truth if self.living else None,
+            self.body_from_image,
+        )
+
     def scans(self) -> Iterator[Scan]:
         """Render the B-scans, one by one."""
         seed = int(np.random.SeedSequence([self.settings.seed, 1]).generate_state(1)[0])
@@ -211,7 +230,7 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     living = None
     if settings.living.lives:
         living = living_body(settings.living, scanned, getattr(settings.path, "surface", ""), settings.own_seed)
-    most_mm = MOST_PRESSED_MM if settings.living.yields else GIVES_MM
+    most_mm = MOST_PRESSED_MM if settings.living.yields else sweep_session.GIVES_MM
     plan = sweep_session.plan_sweep(
         settings.path,
         settings.rig,

@@ -41,21 +41,7 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
         planned = plan_sweep(numbered(settings, number))
     except InputError as error:
         raise InputError(f"sweep {number:06d}: {error}") from None
-    chosen = planned.settings
-    known = sweep_session.PURPOSES[chosen.path.kind] != "probe"
-    sweep_session.write_session(
-        _session(out, settings, number),
-        planned.scene,
-        planned.scanned,
-        chosen.ultrasound,
-        planned.plan,
-        planned.scans(),
-        sweep_session.calibration_of(chosen.rig, chosen.ultrasound) if known else None,
-        None,
-        planned.bodies,
-        planned.truth if planned.living else None,
-        planned.body_from_image,
-    )
+    planned.write(_session(out, settings, number), planned.scans())
     return len(planned.plan.times)
 
 

@@ -108,22 +108,8 @@ def run(config: Config) -> None:
             console.print(line)
         else:
             ConsoleWatch().warn(line)
-    unknown = sweep_session.PURPOSES[config.path.kind] == "probe"
-    probe = None if unknown else sweep_session.calibration_of(config.rig, config.ultrasound)
     start = perf_counter()
-    sweep_session.write_session(
-        session,
-        planned.scene,
-        planned.scanned,
-        config.ultrasound,
-        planned.plan,
-        shown(planned, console),
-        probe,
-        film,
-        planned.bodies,
-        planned.truth if planned.living else None,
-        planned.body_from_image,
-    )
+    planned.write(session, shown(planned, console), film)
     seconds = perf_counter() - start
     width, height = config.ultrasound.image_size
     filmed = f", {moments} pairs of frames" if film else ""

@@ -128,10 +128,12 @@ class ElasticBody:
     def respond(self, nodes: NDArray[np.int64]) -> None:
         """Work out what unit forces on nodes of the skin, by i ny + j, do: with all of their tile, for the same bits always."""
         nx, ny, nz = self.size
-        place = np.full(3 * nx * ny * nz, -1)
-        place[self.free] = np.arange(len(self.free))
         with self.lock:
             wanted = {(node // ny // TILE, node % ny // TILE) for node in nodes.tolist() if node not in self.responses}
+            if not wanted:
+                return
+            place = np.full(3 * nx * ny * nz, -1)
+            place[self.free] = np.arange(len(self.free))
             for a, b in sorted(wanted):
                 i, j = (TILE * first + np.arange(TILE) for first in (a, b))
                 tile = (i[i < nx, None] * ny + j[j < ny]).ravel()
@@ -202,9 +204,8 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
         surface = 3 * soft.size[2] * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))
         compliance = np.stack([soft.responses[node][surface] for node in nodes.tolist()], axis=1)  # (3 k, k, 3)
         compliance = compliance.astype(float).reshape(len(nodes), 3, len(nodes), 3)
-        skin = np.einsum(
-            "ma,aibj,nb->minj", share, compliance, share, optimize=True
-        )  # (m, 3, m, 3) at points by forces on others
+        # (m, 3, m, 3) displacement of each point by a force on each other
+        skin = np.einsum("ma,aibj,nb->minj", share, compliance, share, optimize=True)
         pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
         pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
         root = np.linalg.cholesky(pushed)

@@ -183,9 +183,8 @@ class LivingSweep:
             world_from_body (n, 4, 4) mm; rested_mm (n, h, w, 3): where in the body each STRIDE-th pixel rests, by its true depth;
             centres_mm (n, k, 3): in the world, of what is hidden; resting_centres_mm (k, 3) in the body, and names (k,).
         """
-        inner = [one for one in self.patient.body.solids if not one.is_layer and one.name not in SUPPORTS]
-        inner = [one for one in inner if one is not self.patient.surface]
-        hidden = [one.mesh for one in inner]
+        solids = [one for one in self.patient.body.solids if not one.is_layer and one.name not in SUPPORTS]
+        hidden = {one.name: one.mesh for one in solids if one is not self.patient.surface}
         poses, motion = self.body_from_image(times, world_from_image), self.patient.world_from_body(times)
         width, height = self.transducer.image_size
         sx, sy = self.transducer.scale_mm_per_px
@@ -195,11 +194,13 @@ class LivingSweep:
         for time, pose, carried in zip(times.tolist(), poses, motion, strict=True):
             field = self.field(time, pose)
             rested.append(np.float32(rested_at(field, rigid.apply(pose, pixels))))
-            centres.append([moved_mesh(mesh, carried, field).center_mass for mesh in hidden])
-        resting = np.array([mesh.center_mass for mesh in hidden]).reshape(-1, 3)
-        shapes = np.array(centres).reshape(len(times), len(hidden), 3)
-        return {"world_from_body": motion, "rested_mm": np.array(rested), "centres_mm": shapes, "resting_centres_mm": resting} | {
-            "names": np.array([one.name for one in inner])
+            centres.append([moved_mesh(mesh, carried, field).center_mass for mesh in hidden.values()])
+        return {
+            "world_from_body": motion,
+            "rested_mm": np.array(rested),
+            "centres_mm": np.array(centres).reshape(len(times), len(hidden), 3),
+            "resting_centres_mm": np.array([mesh.center_mass for mesh in hidden.values()]).reshape(-1, 3),
+            "names": np.array(list(hidden)),
         }
 
     def _drag_at(self, time: int, normal: Array) -> Array | None:

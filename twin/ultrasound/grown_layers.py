@@ -33,7 +33,7 @@ class Grown(NamedTuple):
     first: Array  # (3,) mm in the world, the first grid point
     per_mm: float  # grid points
     uneven: NDArray[np.float32]  # (nx, ny, nz) amplitude of backscatter over its tissue's
-    strata: NDArray[np.float32]  # (nx, ny, nz) mm across the strands of tissue
+    strata: NDArray[np.float32]  # (nx, ny, nz, 1) mm across the strands of tissue
     strands: NDArray[np.float32]  # (n, n, m) unevenness from strand to strand, of unit variance, over and over
 
 
@@ -41,12 +41,14 @@ def packed(layers: Layers | None) -> Grown:
     """Layers for compiled code."""
     if layers is None:
         empty = np.zeros((0, 0, 0), np.float32)
-        return Grown(empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty, empty, empty)
+        return Grown(
+            empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty, empty[..., None], empty
+        )
     distance = np.stack([one.distance for one in layers.layers], axis=-1)
     half = np.array([one.half_mm for one in layers.layers], np.float32)
     uneven = np.exp(layers.uneven_db * np.float32(np.log(10) / 20))
     place = np.asarray(layers.origin, float), 1 / layers.step_mm
-    return Grown(distance, _sure(layers.layers), half, *place, uneven, layers.strata_mm, _strands())
+    return Grown(distance, _sure(layers.layers), half, *place, uneven, layers.strata_mm[..., None], _strands())
 
 
 @cache
@@ -149,12 +151,7 @@ def strand_at(strata, strands, first, per_mm, x, y, z):
     cell = cell_at(first, per_mm, strata.shape, x, y, z)
     if cell.i < 0:
         return np.float32(0)
-    i, j, k, a, b, c = cell.i, cell.j, cell.k, cell.a, cell.b, cell.c
-    near = (strata[i, j, k] * (1 - c) + strata[i, j, k + 1] * c) * (1 - b)
-    near += (strata[i, j + 1, k] * (1 - c) + strata[i, j + 1, k + 1] * c) * b
-    far = (strata[i + 1, j, k] * (1 - c) + strata[i + 1, j, k + 1] * c) * (1 - b)
-    far += (strata[i + 1, j + 1, k] * (1 - c) + strata[i + 1, j + 1, k + 1] * c) * b
-    level = near * (1 - a) + far * a
+    level = within(strata, cell, 0)
     return _tiled(strands, x / STRAND_STEPS_MM[0], y / STRAND_STEPS_MM[1], level / STRAND_STEPS_MM[2])
 
 

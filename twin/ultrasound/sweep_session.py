@@ -46,6 +46,7 @@ AnyPath = Annotated[SurfacePath | Hold | Bob | WirePath | RowPath | TiltPath, Fi
 Array = NDArray[np.float64]
 
 POSES = "sweep.npz"  # in the sweep's own folder of truth
+GIVES_MM = 5.0  # by which a surface that keeps its form gives way to the probe, at most
 LIVING = "living.npz"  # of a body that lives
 LABELS = "labels"
 SCANS = "scans"  # of further bodies at the moments of the images; at the cameras' in BODIES
@@ -70,7 +71,7 @@ def plan_sweep(
     seed: int,
     errors: conditions.Motion = STILL,
     carried: Callable[[NDArray[np.int64]], Array] | None = None,
-    gives_mm: float = 5.0,
+    gives_mm: float = GIVES_MM,
 ) -> Plan:
     """Lead the probe along a path, and set the times of its images.
 
