@@ -49,7 +49,7 @@ def array(rays: int, deep_mm: float = 24.0, flat: bool = False) -> Transducer:
     """The peer's array, with a number of rays over the aperture; `flat` sends a flat wave."""
     theirs = peer()["array"]
     figures = {name: theirs[name] for name in ("frequency_mhz", "transmit_focus_mm", "transmit_f_number", "receive_f_number")}
-    figures |= {"bandwidth": (theirs["bandwidth"],) * 2, "aperture_rays": rays}
+    figures |= {"bandwidth": (theirs["bandwidth"],) * 2, "aperture_rays": rays, "band_loss": True}
     if flat:
         figures |= {"transmit_focus_mm": 1000.0, "transmit_f_number": 25.0}  # 40 mm wide
     return QUIET.model_copy(

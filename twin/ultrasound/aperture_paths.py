@@ -3,29 +3,35 @@
 An echo from a place reaches each element of the aperture on a way of its own. Rays are followed straight from the face, in some
 directions that the aperture of a place takes in; for each place, over those that start on the array,
 
-    amplitude = sum(w a) / sum_all(w),   delay = sum(w D) / sum(w),   focus = exp(-2 k^2 var(D - tilt)),
+    amplitude = sqrt(A_t A_r) (B_t B_r)^(1/4),   A = sum(w a) / sum_all(w),   B = sum(w a^2) / sum_all(w),
+    delay = sum(w D) / sum(w),   focus = exp(-2 k^2 var(D - tilt)),
 
-with the aperture's weights w, a ray's amplitude a both ways, and its delay D over that of a medium of the assumed speed. This is
-the mean power, sent and received, and holds for speckle: what a disturbed wave front loses in its focus it sends beside it. A
-delay that rises along the aperture shifts the beam, as refraction does; what is left spoils the focus (Strehl's ratio, by
-Marechal's approximation).
+with the weights w of the aperture that sends and of that which receives, a ray's amplitude a one way, and its delay D over that
+of a medium of the assumed speed, both ways. A is the field in the beam's middle, and B over A² how much wider the beam of a
+partly shaded aperture is: their product is the power of speckle, for which, too, what a disturbed wave front loses in its focus
+it sends beside it. A delay that rises along the aperture shifts the beam, as refraction does; what is left spoils the focus
+(Strehl's ratio, by Marechal's approximation). What shades and bends stands halfway between face and place, by assumption, where
+it matters whether it meets all of a line's beam alike, as it does close to the face, or each place by itself.
 Source: Born & Wolf, Principles of Optics, 9.1; Nock, Trahey & Smith 1989 for phase aberration by tissue.
 """
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
-from recon.compiled import kernel
+from recon.compiled import kernel, njit
 from recon.threads import in_threads
-from twin.ultrasound.beam import receive_aperture
+from twin.ultrasound.beam import Beam, beam, receive_aperture, sent_aperture
 from twin.ultrasound.echo_solids import Body, between, is_sheet
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
-from twin.ultrasound.sound_paths import Paths, normal_at, reflection, squareness, without_contact
+from twin.ultrasound.sound_paths import Paths, low_frequencies, normal_at, reflection, squareness, without_contact
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
 
 NOTHING = -50.0  # nepers, of a ray that begins in air
+ECHO_MM = 3.0  # of depth that the echo of a slanted border takes within a beam; assumed
+FAINT = 1e-4  # amplitude of rays, one way, whose delays don't count
 STRIDE = 4  # levels from one average to the next: between them, it hardly changes
 
 
@@ -45,39 +51,61 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
     along = np.zeros((2, rays, count, levels), np.float32)  # loss and delay down each ray
     tissues = body.acoustics(transducer.frequency_mhz)
     delays = paths.step_mm * (transducer.assumed_speed / tissues.speed - 1)
-    in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, poses, tangents, lines.pitch_mm)
+    spread = transducer.spectral_variance(depths)
+    in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, spread, poses, tangents, lines.pitch_mm)
     along[0, :, without_contact(paths, transducer)] = NOTHING
-    half = receive_aperture(transducer, depths) / 2
-    out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(4)))
+    half = np.stack([sent_aperture(transducer, depths), receive_aperture(transducer, depths)]) / 2
+    out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(5)))
     in_threads(_gather, count, out, along, tangents, half, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
-    return _evened(out, depths * (tangents[1] - tangents[0]) / lines.pitch_mm, lines.pitch_mm) if transducer.refraction else out
+    apart = depths * (tangents[1] - tangents[0]) / lines.pitch_mm
+    out = out._replace(edges=_edges(out.amplitude, out.step_mm, beam(transducer)))
+    return _evened(out, apart, lines.pitch_mm) if transducer.refraction else out
+
+
+def _mean(table: Array, half: NDArray[np.int64]) -> Array:
+    """Means over so many lines to either side, a number for each level."""
+    count = len(table)
+    line, level = np.arange(count)[:, None], np.arange(table.shape[1])[None]
+    first, end = np.maximum(line - half, 0), np.minimum(line + half + 1, count)
+    sums = np.concatenate([np.zeros_like(table[:1], float), np.cumsum(table, axis=0, dtype=float)])
+    return (sums[end, level] - sums[first, level]) / (end - first)
+
+
+def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam) -> NDArray[np.float32]:
+    """Factor after the beam that gives shadows back half of what it blurs of their edges: losses are those of places.
+
+    What shades starts to count ECHO_MM farther down, as it would cut its own border's echo in two.
+    """
+    share, taps = np.abs(spread.lateral) ** 2, np.arange(spread.lateral.shape[1]) - spread.lateral.shape[1] // 2
+    sigma = np.sqrt((share * taps**2).sum(axis=1) / share.sum(axis=1))  # lines; of a box, its half width over the root of 3
+    level, above = np.minimum(np.arange(amplitude.shape[1]), len(share) - 1), round(ECHO_MM / step_mm / 2)
+    power, least = maximum_filter1d(amplitude.astype(float) ** 2, 2 * above + 1, axis=1, origin=above), 1e-9
+    mean = _mean(power, np.rint(np.sqrt(3) * sigma[level]).astype(int))
+    return (((power + least) / (mean + least)).clip(0, 4) ** 0.25).astype(np.float32)
 
 
 def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
     """Paths whose shifts and foci are means over the gaps between rays, and whose amplitudes keep the power of bent beams.
 
     Rays stand so many lines `apart` : (levels,), so that their tilts change from line to line by more than a whole aperture's.
-    Where shifts crowd places on a line it holds more scatterers, but no beam carries more power for being bent.
+    Shifts are those midway between a line and the place it sees. Where they crowd places on a line it holds more scatterers,
+    but no beam carries more power for being bent.
     """
     count = len(paths.labels)
-    half = np.minimum(np.rint(apart / 2).astype(int), count // 2)
-    line, level = np.arange(count)[:, None], np.arange(len(apart))[None]
-    first, end = np.maximum(line - half, 0), np.minimum(line + half + 1, count)
-
-    def mean(table: Array) -> Array:
-        sums = np.concatenate([np.zeros_like(table[:1], float), np.cumsum(table, axis=0, dtype=float)])
-        return (sums[end, level] - sums[first, level]) / (end - first)
-
-    focus = mean(paths.focus)
-    seen = np.sort(pitch_mm * line - mean(paths.shift_mm), axis=0)  # lines never cross, or one would gather the power of three
-    shift = mean(pitch_mm * line - seen)
+    half, along = np.minimum(np.rint(apart / 2).astype(int), count // 2), pitch_mm * np.arange(count)
+    bent = _mean(paths.shift_mm, half) / 2
+    # Lines never cross, or one would gather the power of three
+    seen, shown = np.sort(along[:, None] + bent, axis=0), np.sort(along[:, None] - bent, axis=0)
+    shift = _mean(along[:, None] - np.stack([np.interp(along, *one) for one in zip(seen.T, shown.T, strict=True)], axis=1), half)
     thinned = np.clip(1 - np.gradient(shift, pitch_mm, axis=0), 0.05, 4.0)
-    amplitude = paths.amplitude * np.sqrt(thinned)
-    return Paths(paths.step_mm, paths.labels, paths.shown_mm, *(part.astype(np.float32) for part in (amplitude, shift, focus)))
+    amplitude, focus = paths.amplitude * np.sqrt(thinned), _mean(paths.focus, half)
+    return paths._replace(
+        amplitude=amplitude.astype(np.float32), shift_mm=shift.astype(np.float32), focus=focus.astype(np.float32)
+    )
 
 
 @kernel
-def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tangents, pitch_mm):
+def _follow_rays(first, end, along, paths, solids, tissues, delays, spread, poses, tangents, pitch_mm):
     """Sum loss and delay down the rays that start on some lines, in all directions."""
     count, levels = paths.labels.shape
     step = paths.step_mm
@@ -85,17 +113,18 @@ def _follow_rays(first, end, along, paths, solids, tissues, delays, poses, tange
         tangent = tangents[ray]
         longer = np.sqrt(1 + tangent * tangent)
         for start in range(first, end):
-            loss, delay, place, here = 0.0, 0.0, float(start), paths.labels[start, 0]
+            absorbed, passed, delay, place, here = 0.0, 0.0, 0.0, float(start), paths.labels[start, 0]
             for level in range(1, levels):
                 place += tangent * step / pitch_mm
                 line = int(min(max(place, 0.0), count - 1.0) + 0.5)
                 there = paths.labels[line, level]
                 if there != here:
-                    loss += np.log(max(_passed(solids, tissues, poses[line], step * level, tangent, here, there), 1e-6))
+                    passed += np.log(max(_passed(solids, tissues, poses[line], step * level, tangent, here, there), 1e-6))
                     here = there
-                loss -= longer * step * tissues.loss[there]
+                absorbed += longer * step * tissues.loss[there]
                 delay += longer * delays[there]
-                along[0, ray, start, level], along[1, ray, start, level] = loss, delay
+                along[0, ray, start, level] = passed - absorbed + low_frequencies(absorbed, spread[level])
+                along[1, ray, start, level] = delay
 
 
 @kernel
@@ -113,6 +142,12 @@ def _passed(solids, tissues, pose, depth, tangent, here, there):
     return max(1 - r * r, 0.0)
 
 
+@njit(inline="always")
+def _hann(share):
+    """Weight of a place in shares of half an aperture."""
+    return np.cos(np.pi / 2 * share) ** 2 if share < 1 else 0.0
+
+
 @kernel(fastmath=True)
 def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refract):
     """Average over the rays that meet each place of some lines."""
@@ -126,34 +161,34 @@ def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refrac
             reach += step / pitch_mm
             if level % STRIDE != 0 and level != levels - 1:
                 continue
-            everything = there = power = delay = 0.0
-            sx = sxx = sxd = sdd = 0.0
+            every_sent = every_heard = sent = heard = sent2 = heard2 = 0.0
+            there = delay = sx = sxx = sxd = sdd = 0.0
             for ray in range(rays):
                 start = line - tangents[ray] * reach
-                aside = (start - line) * pitch_mm / half[level]
-                if abs(aside) >= 1:
-                    continue
-                weight = np.cos(np.pi / 2 * aside) ** 2
-                everything += weight
-                if start < 0 or start > count - 1:
+                aside = abs(start - line) * pitch_mm
+                sending, hearing = _hann(aside / half[0, level]), _hann(aside / half[1, level])
+                every_sent, every_heard = every_sent + sending, every_heard + hearing
+                if start < 0 or start > count - 1 or sending + hearing == 0:
                     continue
                 at = min(int(start), count - 2)
                 share = start - at
-                loss = between(along[0, ray, at, level], along[0, ray, at + 1, level], share)
+                one_way = np.exp(between(along[0, ray, at, level], along[0, ray, at + 1, level], share) / 2)
                 d = between(along[1, ray, at, level], along[1, ray, at + 1, level], share)
-                there += weight
-                power += weight * np.exp(loss)
+                sent, sent2 = sent + sending * one_way, sent2 + sending * one_way * one_way
+                heard, heard2 = heard + hearing * one_way, heard2 + hearing * one_way * one_way
+                weight = (sending + hearing) * one_way if one_way > FAINT else 0.0
                 x = start - line
-                delay, sdd = delay + weight * d, sdd + weight * d * d
+                there, delay, sdd = there + weight, delay + weight * d, sdd + weight * d * d
                 sx, sxx, sxd = sx + weight * x, sxx + weight * x * x, sxd + weight * x * d
             if there == 0:
                 there = 1.0
+            both = every_sent * every_heard
             mean, x0 = delay / there, sx / there
             spread, cross = sxx / there - x0 * x0, sxd / there - x0 * mean
             tilt = cross / spread if spread > 1e-6 else 0.0  # mm a line of the face
             left = max(sdd / there - mean * mean - tilt * cross, 0.0)
             out.shown_mm[line, level] = step * level + mean - tilt * x0
-            out.amplitude[line, level] = power / everything
+            out.amplitude[line, level] = np.sqrt(sent * heard / both) * (sent2 * heard2 / both) ** 0.25
             out.shift_mm[line, level] = tilt / pitch_mm * step * level if refract else 0.0
             out.focus[line, level] = np.exp(-2 * (wavenumber * wavenumber) * left)
             for k in range(before + 1, level):

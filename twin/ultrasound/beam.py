@@ -89,16 +89,25 @@ def receive_aperture(transducer: Transducer, depth: Array | float) -> Array:
     return np.clip(np.asarray(depth) / transducer.receive_f_number, NEAREST_MM / 2, transducer.aperture_mm)
 
 
+def sent_aperture(transducer: Transducer, depth: Array) -> Array:
+    """Width of the transmit aperture, mm, that adds to the beam's middle at depths : (n,).
+
+    Beside the focus the phase grows along the aperture; Hann's weight of the width is a half where it is a quarter of a turn.
+    """
+    focus = transducer.focus_mm(depth)
+    bend = np.abs(1 / np.maximum(depth, NEAREST_MM) - 1 / focus)
+    return np.minimum(focus / transducer.transmit_f_number, np.sqrt(8 * transducer.wavelength_mm / np.maximum(bend, 1e-9)))
+
+
 def _lateral(transducer: Transducer, rows: Array) -> tuple[NDArray[np.complex128], NDArray[np.int64]]:
     lines, wavelength = lines_of(transducer), transducer.wavelength_mm
     reach_mm = 4.0  # of the point spread along the array, at most
     taps = int(reach_mm / lines.pitch_mm)
-    transmit = transducer.transmit_focus_mm / transducer.transmit_f_number
     table = np.empty((len(rows), taps + 1), complex)
-    for k, depth in enumerate(np.maximum(rows, NEAREST_MM)):
+    for k, (depth, focus) in enumerate(zip(np.maximum(rows, NEAREST_MM), transducer.focus_mm(rows), strict=True)):
         offsets = lines.pitch_mm * widening(depth, lines.bend) * np.arange(taps + 1)
         receive = float(receive_aperture(transducer, depth))
-        sent = _diffract(offsets, depth, transmit, transducer.transmit_focus_mm, wavelength, apodised=True)
+        sent = _diffract(offsets, depth, focus / transducer.transmit_f_number, focus, wavelength, apodised=True)
         table[k] = sent * _diffract(offsets, depth, receive, depth, wavelength, apodised=True) / receive
         table[k] *= np.exp(-2j * transducer.wavenumber * offsets**2 / 2 * lines.bend / widening(depth, lines.bend))
     faint = 2e-3  # of the peak: the point spread ends there (-54 dB)

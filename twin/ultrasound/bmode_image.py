@@ -59,7 +59,7 @@ def _focused(pulses: Field, transducer: Transducer, beam: Beam, paths: Paths, an
     inner, energies = (beam.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(beam.lateral) ** 2).sum(axis=1)
     alike = (inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1)))[:, None]  # of the same scatterers
     both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike).astype(np.float32)
-    return (np.sqrt(focus) * sharp + np.sqrt(1 - focus) * blurred) / both
+    return (np.sqrt(focus) * sharp + np.sqrt(1 - focus) * blurred) / both * paths.edges[:, row].T
 
 
 @lru_cache(maxsize=8)

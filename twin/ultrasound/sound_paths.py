@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 LEAP_MM = 2.5  # at most, without a look at the tissue; less than the margin of the solids' grids
+LOWEST = 0.5  # share of its frequency by which the middle of an echo's spectrum sinks at most; assumed
 RAGGED = 0.5  # cosine, by which a ragged border turns a line at most; assumed
 GRADIENT_MM = 0.3  # over which a surface's normal is taken
 
@@ -46,6 +47,7 @@ class Paths(NamedTuple):
     amplitude: Map  # (w, m) both ways
     shift_mm: Map  # (w, m) of the beam along the array, by refraction
     focus: Map  # (w, m) share of the energy that keeps its focus; see `aperture_paths`
+    edges: Map  # (w, m) amplitude, after the beam, over that of its places: of edges of shadows that it blurs
 
 
 class _Steps(NamedTuple):
@@ -54,18 +56,20 @@ class _Steps(NamedTuple):
     delay_mm: Array  # (n + 1,) shown depth
     kept: Array  # (n + 1,) amplitude, both ways
     refract: bool  # whether borders turn the line
+    spread: Array  # (m,) variance of an echo's spectrum over its squared frequency; see `low_frequencies`
 
 
 def follow(body: Body, transducer: Transducer, world_from_image: Array) -> Paths:
     """Follow the lines of one pose : world_from_image (4, 4) mm."""
     sy, lines = transducer.scale_mm_per_px[1], lines_of(transducer)
     size = lines.count, int(np.ceil(DEEPER * transducer.depth_mm / sy)) + 1
-    tables = [np.full(size, start, np.float32) for start in (0, 1, 0, 1)]
+    tables = [np.full(size, start, np.float32) for start in (0, 1, 0, 1, 1)]
     paths = Paths(sy, np.zeros(size, np.uint8), *tables)
     along = lines.pitch_mm * np.arange(lines.count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), along)
     tissues = body.acoustics(transducer.frequency_mhz)
-    steps = _Steps(sy * transducer.assumed_speed * (1 / tissues.speed), np.exp(-sy * tissues.loss), transducer.refraction)
+    delays, spread = sy * transducer.assumed_speed * (1 / tissues.speed), transducer.spectral_variance(sy * np.arange(size[1]))
+    steps = _Steps(delays, np.exp(-sy * tissues.loss), transducer.refraction, spread)
     solids = body.packed()
     in_threads(_follow, size[0], paths, solids, tissues, steps, poses)
     lost = without_contact(paths, transducer)
@@ -90,6 +94,15 @@ def reflection(z1, z2, c1, c2, cosine):
         return 1.0
     onwards = np.sqrt(1 - sine2)
     return (z2 * cosine - z1 * onwards) / (z2 * cosine + z1 * onwards)
+
+
+@njit(inline="always")
+def low_frequencies(absorbed, spread):
+    """Nepers by which an echo has lost less than its centre frequency: low ones last longer, and its middle sinks by as much.
+
+    Loss rises with the frequency, and the spectrum is a Gaussian of the variance `spread` over its squared frequency.
+    """
+    return absorbed * min(spread * absorbed, LOWEST) / 2
 
 
 @njit(inline="always")
@@ -180,7 +193,7 @@ def _follow(first, end, paths, solids, tissues, steps, poses):
         x0, y0, z0 = pose[0, 3], pose[1, 3], pose[2, 3]
         here = label_at(solids, x0, y0, z0)
         paths.labels[line, 0] = here
-        delay, left, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0
+        delay, left, absorbed, slope, aside, clear = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0
         for level in range(1, paths.labels.shape[1]):
             t = step * level
             x, y, z = x0 + pose[0, 1] * t, y0 + pose[1, 1] * t, z0 + pose[2, 1] * t
@@ -192,15 +205,18 @@ def _follow(first, end, paths, solids, tissues, steps, poses):
             if there == here:
                 delay += delays[here]
                 left *= steps.kept[here]
+                absorbed += step * tissues.loss[here]
             else:
                 part = _share_before(solids, max(here, there) - 1, pose, (x, y, z), step)
                 passed, turn = _through_border(solids, tissues, pose, (x, y, z), here, there)
                 delay += part * delays[here] + (1 - part) * delays[there]
-                left *= passed * np.exp(-step * (part * tissues.loss[here] + (1 - part) * tissues.loss[there]))
+                lost = step * (part * tissues.loss[here] + (1 - part) * tissues.loss[there])
+                left *= passed * np.exp(-lost)
+                absorbed += lost
                 slope += turn if steps.refract else 0.0
             aside += slope * step
             here = there
             paths.labels[line, level] = here
             paths.shown_mm[line, level] = delay
-            paths.amplitude[line, level] = left
+            paths.amplitude[line, level] = left * np.exp(low_frequencies(absorbed, steps.spread[level]))
             paths.shift_mm[line, level] = aside

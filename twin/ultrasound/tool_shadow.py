@@ -43,8 +43,8 @@ class _Aperture(NamedTuple):
     share: Array  # (n,) of half the width, along the array
     weight: Array  # (n,) Hann's
     across: Array  # (m,) mm
-    transmit_mm: float
-    transmit_focus_mm: float
+    transmit_mm: Array  # (k,) width, by level
+    transmit_focus_mm: Array  # (k,)
     receive_f_number: float
     receive_most_mm: float
     lens_mm: float
@@ -59,7 +59,7 @@ def shaded(paths: Paths, tools: Sequence[Tool], transducer: Transducer, world_fr
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), lines.pitch_mm * along)
     levels = paths.step_mm * LEVELS * np.arange(int(np.ceil(depths / LEVELS)) + 1)
     kept = np.ones((len(along), len(levels)))
-    aperture = _aperture(transducer)
+    aperture = _aperture(transducer, levels)
     for tool in tools:
         ends = np.stack([rigid.apply(rigid.invert(pose), tool.shaft.ends) for pose in poses])
         one = np.ones_like(kept)
@@ -69,15 +69,15 @@ def shaded(paths: Paths, tools: Sequence[Tool], transducer: Transducer, world_fr
     return paths._replace(amplitude=paths.amplitude * map_coordinates(kept, places, order=1).astype(np.float32))
 
 
-def _aperture(transducer: Transducer) -> _Aperture:
+def _aperture(transducer: Transducer, levels: Array) -> _Aperture:
     share = (2 * np.arange(POINTS[0]) + 1) / POINTS[0] - 1
     across = transducer.elevation_mm / 2 * ((2 * np.arange(POINTS[1]) + 1) / POINTS[1] - 1)
     return _Aperture(
         share,
         np.cos(np.pi / 2 * share) ** 2,
         across,
-        transducer.transmit_focus_mm / transducer.transmit_f_number,
-        transducer.transmit_focus_mm,
+        transducer.focus_mm(levels) / transducer.transmit_f_number,
+        transducer.focus_mm(levels),
         transducer.receive_f_number,
         transducer.aperture_mm,
         transducer.elevation_focus_mm,
@@ -162,8 +162,9 @@ def _shade(first, end, kept, ends, radius, levels, aperture, table):
             if y <= max(top, NEAREST_MM):
                 continue
             receive = min(max(y / aperture.receive_f_number, NEAREST_MM / 2), aperture.receive_most_mm)
-            widest = max(receive, aperture.transmit_mm) / 2
+            widest = max(receive, aperture.transmit_mm[level]) / 2
             if _is_clear(ends[line], radius, widest, aperture.across[-1], y, aperture.wavelength_mm):
                 continue
-            transmit = _left(table, ends[line], radius, y, aperture.transmit_mm, 1 / y - 1 / aperture.transmit_focus_mm, aperture)
+            bend = 1 / y - 1 / aperture.transmit_focus_mm[level]
+            transmit = _left(table, ends[line], radius, y, aperture.transmit_mm[level], bend, aperture)
             kept[line, level] = transmit * _left(table, ends[line], radius, y, receive, 0.0, aperture)

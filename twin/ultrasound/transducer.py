@@ -30,7 +30,9 @@ class Transducer(Part):
     assumed_speed: Annotated[float, Field(ge=300, le=5000)] = 1540.0  # m/s
     frequency_mhz: Annotated[float, Field(ge=0.5, le=40)] = 7.5
     bandwidth: tuple[Bandwidth, Bandwidth] = (0.5, 0.4)  # -6 dB of an echo, over the frequency: at the face, at the image's end
+    band_loss: bool = False  # whether high frequencies of an echo are lost first, as in tissue; else all as the centre
     transmit_focus_mm: Positive = 25.0
+    focal_zones_mm: tuple[Positive, ...] = ()  # further foci of a firing each; a depth is shown by the nearest one's
     transmit_f_number: Positive = 3.0  # focus over aperture
     receive_f_number: Positive = 2.0  # dynamic focus and aperture
     aperture_mm: Positive = 19.2  # widest, in receive: 64 elements of 0.3 mm
@@ -140,16 +142,27 @@ class Transducer(Part):
         rows = self.image_size[1] if self.face is None else int(self.depth_mm / self.scale_mm_per_px[1]) + 1
         return self.scale_mm_per_px[1] * np.arange(rows)
 
+    def focus_mm(self, depth_mm: Array) -> Array:
+        """The transmit focus that depths : (m,) are shown by."""
+        foci = np.array([self.transmit_focus_mm, *self.focal_zones_mm])
+        return foci[np.abs(np.asarray(depth_mm)[:, None] - foci).argmin(axis=1)]
+
     def axial_sigma_mm(self, depth_mm: Array) -> Array:
         """Standard deviation in depth of the echo's Gaussian envelope (amplitude).
 
         A spectrum `exp(-(f-f0)²/(2 s²))` of full width B f0 at half amplitude (-6 dB) has s = B f0 / 2.355, and its pulse
         lasts 1/(2 pi s); depth is c/2 times that.
         """
+        return 1e-3 * self.assumed_speed / 2 * np.sqrt(8 * np.log(2)) / (2 * np.pi * self.frequency_mhz * self._band(depth_mm))
+
+    def spectral_variance(self, depth_mm: Array) -> Array:
+        """Variance of an echo's spectrum at depths : (m,) over its squared frequency; 0 without `band_loss`."""
+        return self._band(depth_mm) ** 2 / (8 * np.log(2)) * self.band_loss
+
+    def _band(self, depth_mm: Array) -> Array:
+        """Full width of an echo's spectrum at half amplitude over its frequency, at depths."""
         near, far = self.bandwidth
-        share = np.clip(np.asarray(depth_mm) / max(self.depth_mm, 1e-9), 0, 1)
-        bandwidth_mhz = self.frequency_mhz * (near + (far - near) * share)
-        return 1e-3 * self.assumed_speed / 2 * np.sqrt(8 * np.log(2)) / (2 * np.pi * bandwidth_mhz)
+        return near + (far - near) * np.clip(np.asarray(depth_mm) / max(self.depth_mm, 1e-9), 0, 1)
 
 
 def check_scanner(rig: Rig, transducer: Transducer) -> None:

@@ -31,10 +31,10 @@ OTHER = [  # which the figures follow
 
 @pytest.mark.parametrize(("function", "settings", "figure"), MET, ids=NAMES)
 def test_the_twin_is_within_ten_percent_of_the_peer(function, settings, figure):
-    """All rows that ask it, but that of a shadow's edge, which is too soft."""
+    """All rows that ask it."""
     figures = function(None, **settings)
     named = {name: value for name, value in settings.items() if name != "seeds"}
-    off = [row.what for row in missed(function, figures, **named) if "edge" not in row.what]
+    off = [row.what for row in missed(function, figures, **named)]
     assert not off and figures[figure] < 10
 
 
@@ -56,20 +56,26 @@ def test_without_refraction_nothing_is_shown_aside(monkeypatch):
 
 
 def test_points_behind_a_lobule_are_shown_on_the_peers_side():
-    """Between half and one and a half times as far: straight rays know nothing of waves that bend round its sides."""
+    """Within a quarter: straight rays know nothing of waves that bend round its sides."""
     figures = wave_accuracy.shifts(None, RAYS, "lobule")
     count = len(wave_accuracy.peer()["shifts_lobule"])
     ratio = np.array([figures[f"shift{k}_mm"] / figures[f"peer{k}_mm"] for k in range(count)])
-    assert ((ratio > 0.5) & (ratio < 1.5)).all()
+    assert ((ratio > 0.75) & (ratio < 1.25)).all()
 
 
 def test_the_peers_loss_falls_behind_the_centre_frequencys():
-    """By what a Gaussian spectrum loses in frequency on the way: half the squared loss of its standard deviation, in nepers."""
+    """By what a Gaussian spectrum loses in frequency on the way: half the squared loss of its standard deviation, in nepers.
+
+    So does the twin's, where it loses high frequencies first.
+    """
     record = wave_accuracy.peer()
     last, array = record["losses"][-1], record["array"]
     at_centre = 0.2 * record["loss_db_per_cm_mhz"] * array["frequency_mhz"] * last["depth_mm"]
     nepers = at_centre * np.log(10) / 20 * array["bandwidth"] / np.sqrt(8 * np.log(2))
-    assert at_centre - last["loss_db"] == pytest.approx(20 / np.log(10) * nepers**2 / 2, rel=0.3)
+    gained = 20 / np.log(10) * nepers**2 / 2
+    assert at_centre - last["loss_db"] == pytest.approx(gained, rel=0.3)
+    twins = [wave_accuracy.losses(None, rays) for rays in (1, RAYS)]
+    assert [at_centre - found["deepest_db"] for found in twins] == pytest.approx([gained] * 2, rel=0.1)
 
 
 def test_the_peers_figures_count_as_code():

@@ -66,7 +66,7 @@ def follow(body: Body, transducer: Transducer, pose: np.ndarray, steps: int) -> 
     (sx, step), speed, impedance = transducer.scale_mm_per_px, body.column("speed"), body.column("impedance")
     loss = body.column("attenuation") * transducer.frequency_mhz * 2 / 10 / (20 / np.log(10))  # dB/cm, both ways, to nepers a mm
     size = transducer.image_size[0], steps
-    found = Paths(step, np.zeros(size, np.uint8), np.zeros(size), np.ones(size), np.zeros(size), np.ones(size))
+    found = Paths(step, np.zeros(size, np.uint8), np.zeros(size), np.ones(size), np.zeros(size), np.ones(size), np.ones(size))
     for line in range(size[0]):
         places = rigid.apply(pose, np.column_stack([np.full(steps, sx * line), step * np.arange(steps), np.zeros(steps)]))
         found.labels[line] = labels(body, places)

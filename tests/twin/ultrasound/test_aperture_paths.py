@@ -45,14 +45,17 @@ def test_one_ray_leaves_the_paths_as_they_are():
 
 
 def test_an_even_medium_changes_nothing_but_the_arrays_ends():
-    """There, half of the aperture is missing, and half of the amplitude."""
+    """There, half of the aperture is missing: half of the amplitude both ways, in a beam twice as wide.
+
+    The ray in the middle still is.
+    """
     found = paths()
     depths = found.step_mm * np.arange(found.labels.shape[1])
     np.testing.assert_allclose(found.shown_mm[MIDDLE], depths, atol=1e-3)
     np.testing.assert_allclose(found.amplitude[MIDDLE, 1:240], 1, atol=1e-5)
     np.testing.assert_allclose(found.focus[:, 1:], 1, atol=1e-4)
     assert np.abs(found.shift_mm).max() < 1e-3
-    assert found.amplitude[0, 200] == pytest.approx(0.5, abs=0.08)
+    assert 0.5**1.5 < found.amplitude[0, 200] < 0.55
 
 
 def test_a_loss_is_that_of_the_way_of_the_aperture():
@@ -85,12 +88,12 @@ def test_an_inclined_border_shifts_the_beam_as_refraction_does():
 
 
 def test_a_shadow_widens_and_fills_with_depth():
-    """Behind a bar of 4 mm that lets nothing through, an aperture of half the depth looks past it from 8 mm on."""
+    """Past a bar of 4 mm that lets nothing through, the receiving aperture looks from 20 mm on, the sending one from 27."""
     bar = slab(10.0, 1.0, size=(4.0, 60.0))
     found = paths((bar, Tissue(1.5, 1540.0, 200.0, None)))
     levels = [round(depth / found.step_mm) for depth in (12.0, 22.0, 40.0)]
     near, middle, far = (found.amplitude[MIDDLE, level] for level in levels)
-    assert near < 0.02 and near < middle < far and far > 0.3
+    assert near < 1e-3 and near <= middle < far and far > 0.01
     edges = [np.flatnonzero(found.amplitude[40:280, level] < 0.95) for level in levels]
     widths = [0.1229 * np.ptp(edge) for edge in edges]
     assert widths[0] < 6 < widths[1] < widths[2]

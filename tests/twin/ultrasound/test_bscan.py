@@ -52,6 +52,19 @@ def test_width_along_the_array_is_that_of_diffraction(small):
     assert found == pytest.approx(2 * brentq(excess, 0.05, 0.9), rel=0.05)
 
 
+def test_each_focal_zone_has_the_beam_of_its_focus(small):
+    """A filament in each zone is as wide as under an array with that focus alone, and beside it wider than there."""
+    zoned = small.model_copy(update={"transmit_focus_mm": 10.0, "focal_zones_mm": (22.0,)})
+
+    def width(array, depth):
+        envelope = scan(filament(depth), array, down(array, (0, 0, 0)), 1).envelope
+        return width_at_half(envelope[int(envelope.max(axis=1).argmax())], array.scale_mm_per_px[0])
+
+    single = {focus: small.model_copy(update={"transmit_focus_mm": focus}) for focus in (10.0, 22.0)}
+    for focus, other in ((10.0, 22.0), (22.0, 10.0)):
+        assert width(zoned, focus) == width(single[focus], focus) < width(single[other], focus)
+
+
 @pytest.mark.parametrize("band", [0.4, 0.65])
 def test_width_in_depth_is_that_of_the_pulse(small, band):
     """The envelope of a Gaussian band B f0 wide at half amplitude lasts (4 ln 2 / pi) / (B f0) at half amplitude."""
