@@ -56,6 +56,8 @@ class Transducer(Part):
     dynamic_range_db: Annotated[float, Field(ge=10, le=120)] = 60.0
     bits: Annotated[int, Field(ge=1, le=8)] = 8
     picture: Picture = Picture()
+    screen: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = None
+    """width, height, px, of the scanner's screen, sent as a whole, with the B-scan in its middle; null sends the B-scan alone"""
 
     @model_validator(mode="before")
     @classmethod
@@ -84,6 +86,14 @@ class Transducer(Part):
         if self.depth_mm < 1:
             found = f"{self.scale_mm_per_px[1] * (self.image_size[1] - 1):g} mm, with {self.face_mm[1]:g} mm of the face's arc"
             raise ValueError(f"image_size: expected an image deeper than the face's arc by 1 mm or more, found {found}")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_its_screen(self) -> "Transducer":
+        beside, above = 120, 90  # px, for greys and ruler, and for texts
+        least = self.image_size[0] + beside, self.image_size[1] + above
+        if self.screen is not None and (self.screen[0] < least[0] or self.screen[1] < least[1]):
+            raise ValueError(f"screen: expected {least[0]}x{least[1]} px or more around the image, found {list(self.screen)}")
         return self
 
     @model_validator(mode="after")
