@@ -1,4 +1,4 @@
-"""A scanner's screen around the B-scan, as a frame grabber or a recorded clip brings it: settings, ruler, greys, focus and clock."""
+"""A scanner's screen around the B-scan, as frame grabbers and clips bring it: settings, ruler, greys, focus and clock."""
 
 import cv2
 import numpy as np
