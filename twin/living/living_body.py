@@ -28,7 +28,8 @@ from twin.displacement import LEAST_STRETCH, NOWHERE, Displacement, led_through,
 from twin.living import elastic_body
 from twin.living.elastic_body import ElasticBody
 from twin.ultrasound.echo_solids import Body, Solid
-from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
+from twin.ultrasound.probe_path import FOOT
+from twin.ultrasound.scan_lines import lines_of, middle_of_face, world_from_face, world_from_lines
 from twin.ultrasound.sweep_session import SUPPORTS, surface_of
 from twin.ultrasound.transducer import Transducer
 
@@ -36,9 +37,7 @@ Array = NDArray[np.float64]
 Moments = NDArray[np.int64]
 
 STREAM = 17  # of random numbers, apart from others of a session
-FOOT_MM, LENS_RADIUS_MM = 14.0, 15.0  # of the probe's foot across the array, and of its rounding; assumed
-ENDS_MM, END_RADIUS_MM = 4.0, 6.0  # of the foot beyond the array at each end, and of its rounding there; assumed
-FOOT_POINTS = (17, 7)  # of it, along and across, that may touch the skin
+FOOT_POINTS = (17, 7)  # of the probe's foot, along and across, that may touch the skin
 BEATING_MM = 35.0  # standard deviation of the place over which the chest's wall beats; assumed
 PULSE = 0.12  # of a beat, over which the wall goes out and comes back; assumed
 STRIDE = 8  # pixels, of the truth that is kept
@@ -216,7 +215,7 @@ class LivingSweep:
         Skin follows the face until it is drawn out: a way ds adds `ds - |ds| d / most` to its displacement d.
         """
         poses = self.body_from_image(self.path.times, self.path.poses)
-        middle = (world_from_face(self.transducer, poses) @ np.append(_middle(self.transducer), 1.0))[:, :3]
+        middle = (world_from_face(self.transducer, poses) @ middle_of_face(self.transducer))[:, :3, 3]
         steps = np.diff(middle, axis=0, prepend=middle[:1])
         steps -= poses[:, :3, 1] * (steps * poses[:, :3, 1]).sum(axis=1, keepdims=True)
         drags, drawn = np.zeros_like(steps), np.zeros(3)
@@ -271,17 +270,13 @@ def _about(point: Array, rotation: Array) -> Array:
     return turn
 
 
-def _middle(transducer: Transducer) -> Array:
-    return np.array([transducer.face_mm[0] if transducer.face is None else 0.0, 0.0, 0.0])
-
-
 def _foot(transducer: Transducer, body_from_image: Array) -> tuple[Array, Array]:
     """Points of the probe's foot : (m, 3) mm, rounded across the array and at its ends, and the face's normal : (3,)."""
     lines = lines_of(transducer)
-    places = np.linspace(-ENDS_MM, 2 * lines.middle_mm + ENDS_MM, FOOT_POINTS[0])
-    across = FOOT_MM * np.linspace(-0.5, 0.5, FOOT_POINTS[1])
+    places = np.linspace(-FOOT.ends_mm, 2 * lines.middle_mm + FOOT.ends_mm, FOOT_POINTS[0])
+    across = FOOT.across_mm * np.linspace(-0.5, 0.5, FOOT_POINTS[1])
     beyond = np.maximum(np.abs(places - lines.middle_mm) - lines.middle_mm, 0)
-    back = beyond[:, None] ** 2 / (2 * END_RADIUS_MM) + across**2 / (2 * LENS_RADIUS_MM)
+    back = beyond[:, None] ** 2 / (2 * FOOT.end_radius_mm) + across**2 / (2 * FOOT.lens_radius_mm)
     poses = world_from_lines(lines, world_from_face(transducer, body_from_image), places)[:, None]
     points = poses[..., :3, 3] + across[:, None] * poses[..., :3, 2] - back[..., None] * poses[..., :3, 1]
     return points.reshape(-1, 3), body_from_image[:3, 1]
