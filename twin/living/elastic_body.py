@@ -1,15 +1,14 @@
 """A soft body on a hard base under a probe's face: linear elasticity by finite elements, with contact that only pushes.
 
 The body is meshed in columns along the world's z, from the skin that faces the cameras down to what holds it. Elements are
-trilinear hexahedra of nearly incompressible, isotropic tissue; the change of volume counts in their middles alone, so that they
-don't lock (selective reduced integration). The face is a set of points; a point that lies below the skin pushes it along the
-face's normal until it lies in the face, and none pulls:
+trilinear hexahedra of nearly incompressible, isotropic tissue, integrated in full. The face is a set of points; a point that lies
+below the skin pushes it along the face's normal until it lies in the face, and none pulls:
 
     f >= 0,  C f - d >= 0,  f (C f - d) = 0,
 
 with the compliance C of the skin at the points and their depths d below the resting skin: Signorini's conditions, solved as a
 non-negative least-squares problem.
-Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wriggers 2006, Computational Contact Mechanics, 5.
+Sources: Hughes 2000, The Finite Element Method, 3; Wriggers 2006, Computational Contact Mechanics, 5.
 """
 
 from dataclasses import dataclass, field
@@ -354,42 +353,33 @@ def _label(first, end, labels, points, solids):
 
 
 def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
-    """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty."""
-    import skfem  # takes half a second, which bodies that keep their form do without
-    from skfem.helpers import ddot, div, eye, sym_grad, trace
+    """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty.
 
+    With the gradients g and h of two nodes' shares, `K_ij = mu (g.h delta_ij + g_j h_i - 2/3 g_i h_j) + k g_i h_j`, summed over
+    two Gauss's points along each axis.
+    """
     nx, ny, nz = (*mesh.skin.shape, len(LAYERS) + 1)
     number = np.arange(nx * ny * nz).reshape(nx, ny, nz)
-    corner = {(i, j, k): number[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i in (0, 1) for j in (0, 1) for k in (0, 1)}
-    order = [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]  # of scikit-fem's corners
-    kept = np.broadcast_to(mesh.kept[..., None], modulus.shape)
-    cells = np.stack([corner[place][kept] for place in order])
-    used = np.unique(cells)
-    compact = np.full(number.size, -1)
-    compact[used] = np.arange(len(used))
-    hexes = skfem.MeshHex(mesh.nodes().reshape(-1, 3)[used].T.copy(), compact[cells])
-    shear = modulus[kept] / 3
-    element = skfem.ElementVector(skfem.ElementHex1())
-
-    @skfem.BilinearForm
-    def deviatoric(u, v, w):
-        strain = sym_grad(u)
-        return 2 * w["shear"] * ddot(strain - eye(trace(strain) / 3, 3), sym_grad(v))
-
-    @skfem.BilinearForm
-    def volumetric(u, v, w):
-        return w["bulk"] * div(u) * div(v)
-
-    whole, middle = (skfem.Basis(hexes, element, intorder=order) for order in (2, 1))
-    each = {basis: shear[:, None] * np.ones((1, basis.dx.shape[1])) for basis in (whole, middle)}
-    bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))
-    matrix: Any = deviatoric.assemble(whole, shear=each[whole]) + volumetric.assemble(middle, bulk=bulk * each[middle])
-    places = np.empty(matrix.shape[0], np.int64)
-    numbers: Any = whole.nodal_dofs
-    places[numbers.T.ravel()] = (3 * used[:, None] + np.arange(3)).ravel()
-    found = matrix.tocoo()
-    size = 3 * number.size
-    return sparse.csr_matrix((found.data, (places[found.row], places[found.col])), (size, size))
+    corners = np.array(list(np.ndindex(2, 2, 2)))  # (8, 3)
+    nodes, total = mesh.nodes().reshape(-1, 3), sparse.csr_matrix((3 * number.size, 3 * number.size))
+    bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))  # over the shear modulus
+    for i in range(nx - 1):  # a plane of elements at once
+        kept = np.broadcast_to(mesh.kept[i, :, None], modulus.shape[1:])
+        cells = np.stack([number[i + p, q : ny - 1 + q, r : nz - 1 + r][kept] for p, q, r in corners.tolist()], axis=1)  # (n, 8)
+        shear, stiff = modulus[i][kept] / 3, np.zeros((len(cells), 8, 3, 8, 3))
+        for point in 0.5 + (corners - 0.5) / np.sqrt(3):
+            sides, signs = np.where(corners, point, 1 - point), 2.0 * corners - 1
+            slopes = np.stack([signs[:, n] * np.delete(sides, n, axis=1).prod(axis=1) for n in range(3)], axis=1)  # (8, 3)
+            lengths = np.einsum("cu,ncx->nux", slopes, nodes[cells])
+            gradient = np.einsum("nxu,cu->ncx", np.linalg.inv(lengths), slopes)
+            weight = shear * np.linalg.det(lengths) / 8
+            each = np.einsum("n,nai,nbj->naibj", weight, gradient, gradient, optimize=True)
+            stiff += each.transpose(0, 1, 4, 3, 2) + (bulk - 2 / 3) * each
+            stiff += np.einsum("naxbx,ij->naibj", each, np.eye(3))
+        rows = (3 * cells[..., None] + np.arange(3)).reshape(len(cells), 24)
+        places = np.repeat(rows, 24, axis=1).ravel(), np.tile(rows, (1, 24)).ravel()
+        total += sparse.csr_matrix((stiff.ravel(), places), total.shape)
+    return total
 
 
 def spread(soft: ElasticBody, moved: Array) -> Flow:
