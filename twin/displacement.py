@@ -1,4 +1,4 @@
-"""Displacement of a body's points: a field on a grid, its inverse, and both for compiled code.
+"""Displacement of a body's points: a field on a grid, its inverse, and both for compiled code; and flows that lead to one.
 
 A point that rests at X lies at `x = X + u(X)`, with u trilinear between the points of a grid and constant beyond it: this defines
 where everything is. Where x rested follows from a table of the inverse and steps `X <- x - u(X)`, which halve the error at least
@@ -19,7 +19,9 @@ Field = NDArray[np.float32]
 
 STEPS = 2  # from the table of the inverse on: the error falls below 0.01 mm in a dent of 3 mm within 8 mm
 LEAST_STRETCH = 0.3  # that counts; where a field shrinks lengths by more, borders may be missed
-STEPS_OF_TABLE = 40  # at the table's own points
+STEPS_OF_TABLE = 40  # at the table's own points, at most
+STILL_MM = 1e-4  # by which a step moves a point whose rest is found: less than lies between the table's points
+STEPS_OF_FLOW = 4
 
 
 class Displacement(NamedTuple):
@@ -36,34 +38,41 @@ NOWHERE = Displacement(np.zeros(3), 1.0, np.zeros((0, 0, 0, 3), np.float32), np.
 """of a body that keeps its form"""
 
 
+class Flow(NamedTuple):
+    """A steady flow, trilinear between the points of a grid and constant beyond it, for compiled code."""
+
+    first: Array  # (3,) mm in the world, the first grid point
+    per_mm: float  # grid points
+    moved: Field  # (nx, ny, nz, 3) mm, in a unit of time
+
+
 def displacement(first: Array, step_mm: float, moved: Field) -> Displacement:
     """Set up a field : (nx, ny, nz, 3) mm on a grid in the world, and the table of its inverse."""
     moved = np.ascontiguousarray(moved, np.float32)
-    slopes = sum(np.square(_slope(moved, axis)).sum(axis=-1) for axis in range(3)) / step_mm**2
-    stretch = max(1 - float(np.sqrt(np.max(slopes))), LEAST_STRETCH)
+    slopes = np.zeros(len(moved) - 1)
+    in_threads(_steepest, len(slopes), slopes, moved)
+    stretch = max(1 - float(np.sqrt(slopes.max())) / step_mm, LEAST_STRETCH)
     field = Displacement(np.asarray(first, float), 1 / step_mm, moved, np.zeros_like(moved), stretch)
     in_threads(_tabulate, len(moved), field)
     return field
 
 
-def led_through(field: Displacement) -> Displacement:
+def led_through(flow: Flow) -> Displacement:
     """The displacement of points that drift through a field of small displacements, as through a steady flow.
 
     The flow of a field without divergence keeps volumes, where the field itself keeps them to first order alone.
     Midpoint rule, in steps of a quarter.
     """
-    steps = 4
-    whole, half = (field._replace(moved=field.moved / np.float32(n * steps)) for n in (1, 2))
-    rested = np.stack(np.meshgrid(*_axes(field), indexing="ij"), axis=-1)
-    place = rested
-    for _ in range(steps):
-        middle = moved_to(half, place)
-        place = place + (moved_to(whole, middle) - middle)
-    return displacement(field.first, 1 / field.per_mm, (place - rested).astype(np.float32))
+    moved = np.zeros_like(flow.moved)
+    in_threads(_lead, len(moved), moved, flow)
+    return displacement(flow.first, 1 / flow.per_mm, moved)
 
 
-def _axes(field: Displacement) -> list[Array]:
-    return [start + np.arange(count) / field.per_mm for start, count in zip(field.first, field.moved.shape[:3], strict=True)]
+def led_to(flow: Flow, points: Array) -> Array:
+    """Where points : (n, 3) mm lie that rested at these, by `led_through`, of which the cells about them alone are worked out."""
+    found = points.copy()
+    in_threads(_lead_some, len(points), found, points, flow)
+    return found
 
 
 def moved_to(field: Displacement, points: Array) -> Array:
@@ -143,6 +152,67 @@ def carried_back(moved, back, first, per_mm, x, y, z):
     return _stepped(moved, first, per_mm, (x, y, z), (x + u, y + v, z + w), STEPS)
 
 
+@njit(inline="always")
+def _drift(flow, x, y, z):
+    """By how much a point drifts in one of the steps of a unit of time: midpoint rule."""
+    step = 1 / STEPS_OF_FLOW
+    u, v, w = _vector(flow.moved, flow.first, flow.per_mm, x, y, z)
+    u, v, w = _vector(flow.moved, flow.first, flow.per_mm, x + step / 2 * u, y + step / 2 * v, z + step / 2 * w)
+    return step * u, step * v, step * w
+
+
+@kernel
+def _lead(first, end, moved, flow):
+    """Fill planes of a field : of zeros by how far the grid's points drift, a column at once, as none waits for another."""
+    step = 1 / flow.per_mm
+    for i in range(first, end):
+        x = flow.first[0] + step * i
+        for j in range(moved.shape[1]):
+            y = flow.first[1] + step * j
+            for _ in range(STEPS_OF_FLOW):
+                for k in range(moved.shape[2]):
+                    z = flow.first[2] + step * k
+                    u, v, w = _drift(flow, x + moved[i, j, k, 0], y + moved[i, j, k, 1], z + moved[i, j, k, 2])
+                    moved[i, j, k, 0] += u
+                    moved[i, j, k, 1] += v
+                    moved[i, j, k, 2] += w
+
+
+@kernel
+def _lead_some(first, end, found, points, flow):
+    """Carry points along with the corners of their cells."""
+    step = 1 / flow.per_mm
+    for n in range(first, end):
+        cell = nearest_cell(flow.first, flow.per_mm, flow.moved.shape, points[n, 0], points[n, 1], points[n, 2])
+        for corner in range(8):
+            a, b, c = corner // 4, corner // 2 % 2, corner % 2
+            share = (cell.a if a else 1 - cell.a) * (cell.b if b else 1 - cell.b) * (cell.c if c else 1 - cell.c)
+            x, y = flow.first[0] + step * (cell.i + a), flow.first[1] + step * (cell.j + b)
+            z = flow.first[2] + step * (cell.k + c)
+            for _ in range(STEPS_OF_FLOW):
+                u, v, w = _drift(flow, x, y, z)
+                x, y, z = x + u, y + v, z + w
+                found[n, 0], found[n, 1], found[n, 2] = found[n, 0] + share * u, found[n, 1] + share * v, found[n, 2] + share * w
+
+
+@kernel
+def _steepest(first, end, slopes, moved):
+    """The largest sum of squared differences along all three axes, in the middle of a cell, of planes of cells."""
+    for i in range(first, end):
+        for j in range(moved.shape[1] - 1):
+            for k in range(moved.shape[2] - 1):
+                slope = 0.0
+                for n in range(3):
+                    p, q = moved[i, j, k, n], moved[i, j, k + 1, n]
+                    r, s = moved[i, j + 1, k, n], moved[i, j + 1, k + 1, n]
+                    t, u = moved[i + 1, j, k, n], moved[i + 1, j, k + 1, n]
+                    v, w = moved[i + 1, j + 1, k, n], moved[i + 1, j + 1, k + 1, n]
+                    slope += ((t + u + v + w - p - q - r - s) / 4) ** 2
+                    slope += ((r + s + v + w - p - q - t - u) / 4) ** 2
+                    slope += ((q + s + u + w - p - r - t - v) / 4) ** 2
+                slopes[i] = max(slopes[i], slope)
+
+
 @kernel
 def _tabulate(first, end, field):
     """Fill planes of the inverse's table."""
@@ -158,7 +228,7 @@ def _tabulate(first, end, field):
                     u, v, w = _vector(field.moved, field.first, field.per_mm, rx, ry, rz)
                     off = abs(x - u - rx) + abs(y - v - ry) + abs(z - w - rz)
                     rx, ry, rz = x - u, y - v, z - w
-                    if off < 1e-6:
+                    if off < STILL_MM:
                         break
                 back[i, j, k, 0], back[i, j, k, 1], back[i, j, k, 2] = rx - x, ry - y, rz - z
 

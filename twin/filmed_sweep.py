@@ -179,7 +179,7 @@ class PlannedSweep:
         living = self.living
         if living is not None and living.patient.living.yields:
             assert living.patient.soft  # before threads ask for it
-        field = None if living is None else (lambda k: living.field(times[k], poses[k]))
+        field = None if living is None else (lambda k: living.under_image(times[k], poses[k]))
         return scans(self.scanned, self.settings.ultrasound, poses, seed, tools, field)
 
     def film(self, ranges: DataRanges, shown: Shown = lambda frames, _: frames) -> "SceneFilm":

@@ -85,7 +85,7 @@ def lead(
         If a body finds no path, or an insertion is led by a body without a tip.
     """
     standing = led.standing(rig)
-    face, bodies = mean_pose(scan_lines.world_from_face(transducer, plan.truth.poses) @ _middle(transducer)), {}
+    face, bodies = mean_pose(scan_lines.world_from_face(transducer, plan.truth.poses) @ scan_lines.middle_of_face(transducer)), {}
     some = np.unique(np.linspace(0, len(plan.target.times) - 1, POSES_LOOKED_AT).astype(int))
     others = [(rig.target, plan.target.poses()[some])]
     numbered = sorted(enumerate(rig.bodies, 1), key=lambda each: led.look(each[1]).IN_A_HAND)  # what stands comes first
@@ -105,12 +105,6 @@ def lead(
 def mean_pose(poses: Array) -> Array:
     """Mean (4, 4) of poses (n, 4, 4)."""
     return rigid.transform(Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix(), poses[:, :3, 3].mean(axis=0))
-
-
-def _middle(transducer: Transducer) -> Array:
-    """Frame of the middle of the face in that of the face."""
-    aside = transducer.face_mm[0] if transducer.face is None else 0.0
-    return rigid.transform(np.eye(3), [aside, 0.0, 0.0])
 
 
 def _along(way: Way, moments: NDArray[np.int64]) -> Track:

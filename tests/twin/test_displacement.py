@@ -2,10 +2,12 @@ import numpy as np
 
 from twin.displacement import (
     NOWHERE,
+    Flow,
     carried_along,
     carried_back,
     displacement,
     led_through,
+    led_to,
     moved_to,
     rested_at,
     volume_ratio,
@@ -61,9 +63,15 @@ def test_a_flow_without_divergence_keeps_volumes_where_its_field_does_to_first_o
     swirl = np.stack([z * hill / 8, 0 * y, -x * hill / 8], axis=-1)  # the curl of a potential along y, but for what y does
     field = displacement(FIRST, STEP, swirl.astype(np.float32))
     inner = np.s_[2:-2, 2:-2, 2:-2]
-    plain, flowing = (np.abs(volume_ratio(one)[inner] - 1).max() for one in (field, led_through(field)))
+    led = led_through(Flow(FIRST, 1 / STEP, field.moved))
+    plain, flowing = (np.abs(volume_ratio(one)[inner] - 1).max() for one in (field, led))
     assert plain > 0.02
     assert flowing < 0.2 * plain
+
+
+def test_some_points_are_led_as_by_the_whole_field(rng):
+    points, flow = rng.uniform([-40, -15, 635], [25, 15, 685], (500, 3)), Flow(FIRST, 1 / STEP, dented().moved)
+    np.testing.assert_allclose(led_to(flow, points), moved_to(led_through(flow), points), atol=1e-6)
 
 
 def test_nothing_moves_without_a_field(rng):

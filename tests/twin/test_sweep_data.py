@@ -8,6 +8,7 @@ from recon.errors import InputError
 from twin import sweep_data
 from twin.engine import Engine
 from twin.filmed_sweep import SweepSettings
+from twin.living.living_body import Living
 from twin.ultrasound.probe_path import Hold
 from twin.ultrasound.transducer import Transducer
 
@@ -54,3 +55,15 @@ def test_engines_give_the_same_bytes(settings, tmp_path):
     for name, engine in (("one", Engine()), ("two", Engine(workers=2)), ("dask", Engine(name="dask", workers=2))):
         assert sorted(sweep_data.make(tmp_path / name, settings, [0, 1], engine)) == [3, 3]
     assert digest(tmp_path / "one") == digest(tmp_path / "two") == digest(tmp_path / "dask")
+
+
+@pytest.mark.slow
+def test_engines_give_the_same_bytes_of_patients(settings, tmp_path):
+    """Who breathe and yield, whatever was worked out before in the same process."""
+    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0)
+    small = {"kind": "breast", "size_mm": (90.0, 70.0, 35.0), "apex_mm": (5.0, -3.0), "areola_width_mm": 25.0, "tumours": ()}
+    held = Hold(place_mm=(4.0, -2.0), seconds=0.2, standoff_mm=-1.0)
+    patients = settings.model_copy(update={"scene": small, "living": living, "path": held})
+    for name, engine in (("one", Engine()), ("two", Engine(workers=2))):
+        assert sorted(sweep_data.make(tmp_path / name, patients, [0, 1], engine)) == [5, 5]
+    assert digest(tmp_path / "one") == digest(tmp_path / "two")

@@ -1,15 +1,14 @@
 """A soft body on a hard base under a probe's face: linear elasticity by finite elements, with contact that only pushes.
 
 The body is meshed in columns along the world's z, from the skin that faces the cameras down to what holds it. Elements are
-trilinear hexahedra of nearly incompressible, isotropic tissue; the change of volume counts in their middles alone, so that they
-don't lock (selective reduced integration). The face is a set of points; a point that lies below the skin pushes it along the
-face's normal until it lies in the face, and none pulls:
+trilinear hexahedra of nearly incompressible, isotropic tissue, integrated in full. The face is a set of points; a point that lies
+below the skin pushes it along the face's normal until it lies in the face, and none pulls:
 
     f >= 0,  C f - d >= 0,  f (C f - d) = 0,
 
 with the compliance C of the skin at the points and their depths d below the resting skin: Signorini's conditions, solved as a
 non-negative least-squares problem.
-Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wriggers 2006, Computational Contact Mechanics, 5.
+Sources: Hughes 2000, The Finite Element Method, 3; Wriggers 2006, Computational Contact Mechanics, 5.
 """
 
 from dataclasses import dataclass, field
@@ -20,20 +19,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky, get_lapack_funcs
 from scipy.optimize import nnls
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from recon.compiled import kernel
 from recon.threads import in_threads
-from twin.displacement import Displacement, displacement, led_through, moved_to
+from twin.displacement import Displacement, Flow, led_through, led_to
 from twin.ultrasound.echo_solids import Body, Solid, label_at
 from twin.ultrasound.probe_path import top
 
 Array = NDArray[np.float64]
+Tile = tuple[int, int]  # of the skin, along x and y
 
 ELEMENT_MM = 3.0  # along x and y: displacements under a probe are then within 2 % of those of 2.5 mm
 TILE = 4  # nodes of the skin along x and y whose responses are worked out at once
+KEPT = 32  # tiles whose responses are kept, of 20 MB each by default; a face lies on up to 18
 LAYERS = (0.04, 0.06, 0.08, 0.11, 0.15, 0.18, 0.19, 0.19)  # heights of a column's elements over its own, from the skin
 BESIDE_MM = 15.0  # of the mesh beside a body that lies on a soft support
 HELD_MM = 10.0  # below a soft support's surface, where bone holds it; assumed
@@ -71,41 +72,51 @@ class Mesh(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlaneFactor:
-    """Cholesky's factor of a stiffness that couples each plane of nodes with the next ones alone, plane by plane."""
+    """Block elimination of a stiffness that couples each plane of nodes with the next ones alone, plane by plane.
 
-    ends: NDArray[np.int64]  # (p + 1,) first unknown of each of the p planes, and the end
-    own: list[Array]  # (p,) lower triangles L, of (m, m)
-    before: list[Array]  # (p,) C = A L'^-T of the coupling A with the plane before, whose triangle is L'; empty of the first
+    With the blocks K of p planes and their couplings A with the planes before, of m unknowns each, `S = K - A S'^-1 A^T` of the
+    plane before. Inverses are kept in single precision, and what that leaves of the forces is solved for once more: without, 4e-6
+    of the largest displacement is wrong, and compliances under a face are no longer positive.
+    """
+
+    stiffness: sparse.csr_matrix  # (m p, m p)
+    ends: NDArray[np.int64]  # (p + 1,) first unknown of each plane, and the end
+    inverses: list[NDArray[np.float32]]  # (p,) S^-1 : (m, m)
+    before: list[sparse.csr_matrix]  # (p,) A : (m, m'), of which the first plane has none
 
     @classmethod
     def of(cls, stiffness: Any, ends: NDArray[np.int64]) -> "PlaneFactor":
-        """Factorise a sparse matrix, on one thread, for the same bits anywhere."""
-        own, before = list[Array](), list[Array]()
+        """Eliminate the unknowns of a sparse matrix, on one thread, for the same bits anywhere."""
+        inverses, before, inverse = list[NDArray[np.float32]](), list[Any](), np.zeros((0, 0))
+        invert: Any = get_lapack_funcs("potri", (inverse,))
         with threadpool_limits(1):
             for k, (first, end) in enumerate(pairwise(ends.tolist())):
-                block, coupling = stiffness[first:end, first:end].toarray(), np.zeros((end - first, 0))
-                if k:
-                    with_before = stiffness[ends[k - 1] : first, first:end].toarray()
-                    coupling = np.transpose(solve_triangular(own[-1], with_before, lower=True, check_finite=False))
-                    block -= coupling @ coupling.T
-                own.append(np.tril(cholesky(block, lower=True, overwrite_a=True, check_finite=False)))
-                before.append(np.ascontiguousarray(coupling))
-        return cls(ends, own, before)
+                coupling = stiffness[first:end, ends[max(k - 1, 0)] : first]
+                block = stiffness[first:end, first:end].toarray()
+                block -= coupling @ np.ascontiguousarray((coupling @ inverse).T)
+                root = cholesky(block, lower=True, overwrite_a=True, check_finite=False)
+                inverse, _ = invert(root, lower=True, overwrite_c=True)
+                inverse = np.ascontiguousarray(np.tril(inverse) + np.tril(inverse, -1).T)
+                inverses.append(inverse.astype(np.float32))
+                before.append(coupling.astype(np.float32))
+        return cls(stiffness, ends, inverses, before)
 
     def solve(self, forces: Array) -> Array:
-        """Displacements : (m, k) by forces : (m, k); bits depend on k."""
-        found = forces.astype(float)
-        parts = [slice(*ends) for ends in pairwise(self.ends.tolist())]
-        with threadpool_limits(1):
-            for k, part in enumerate(parts):
-                if k:
-                    found[part] -= self.before[k] @ found[parts[k - 1]]
-                found[part] = solve_triangular(self.own[k], found[part], lower=True, check_finite=False)
-            for k in reversed(range(len(parts))):
-                if k + 1 < len(parts):
-                    found[parts[k]] -= self.before[k + 1].T @ found[parts[k + 1]]
-                found[parts[k]] = solve_triangular(self.own[k], found[parts[k]], lower=True, trans="T", check_finite=False)
-        return found
+        """Displacements : (m p, k) by forces : (m p, k); bits depend on k and on the number of BLAS's threads."""
+        found = self._nearly(forces)
+        return found + self._nearly(forces - self.stiffness @ found)
+
+    def _nearly(self, forces: Array) -> Array:
+        """The same in single precision."""
+        found, parts = np.float32(forces), [slice(*ends) for ends in pairwise(self.ends.tolist())]
+        for k, part in enumerate(parts):
+            if k:
+                found[part] -= self.before[k] @ found[parts[k - 1]]
+            if found[part].any():  # planes before all forces rest as yet
+                found[part] = self.inverses[k] @ found[part]
+        for k in reversed(range(len(parts) - 1)):
+            found[parts[k]] -= self.inverses[k] @ (self.before[k + 1].T @ found[parts[k + 1]])
+        return found.astype(float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,39 +128,48 @@ class ElasticBody:
     factor: PlaneFactor  # of the stiffness of these
     coupling: sparse.csr_matrix  # (m, k) stiffness between these and those of the base
     held: NDArray[np.int64]  # (k,) numbers of the base's degrees of freedom
-    responses: dict[int, NDArray[np.float32]] = field(default_factory=dict)  # (3 n, 3) by node of the skin, mm for each force
+    responses: dict[Tile, dict[int, NDArray[np.float32]]] = field(default_factory=dict)  # kept, the one used last at the end
     lock: RLock = field(default_factory=RLock)  # of the responses, and of all threads of linear algebra
+    blas: ThreadpoolController = field(default_factory=ThreadpoolController)  # found once, which takes 5 ms
 
     @property
     def size(self) -> tuple[int, int, int]:
         """Nodes along x, y and depth."""
         return len(self.mesh.x), len(self.mesh.y), len(LAYERS) + 1
 
-    def respond(self, nodes: NDArray[np.int64]) -> None:
-        """Work out what unit forces on nodes of the skin, by i ny + j, do: with all of their tile, for the same bits always."""
+    def respond(self, nodes: NDArray[np.int64]) -> dict[int, NDArray[np.float32]]:
+        """Displacements : (3, 3 n) mm of all nodes by unit forces on nodes of the skin, by i ny + j, and on those beside them.
+
+        All of a tile are worked out at once, for the same bits always, and the KEPT tiles that were used last are kept.
+        """
+        with self.lock, self.blas.limit(limits=1):
+            found: dict[int, NDArray[np.float32]] = {}
+            for tile in sorted({(node // self.size[1] // TILE, node % self.size[1] // TILE) for node in nodes.tolist()}):
+                self.responses[tile] = self.responses.pop(tile, None) or self._responses_of(tile)
+                found |= self.responses[tile]
+                while len(self.responses) > KEPT:
+                    del self.responses[next(iter(self.responses))]
+            return found
+
+    def _responses_of(self, tile: Tile) -> dict[int, NDArray[np.float32]]:
         nx, ny, nz = self.size
-        with self.lock:
-            wanted = {(node // ny // TILE, node % ny // TILE) for node in nodes.tolist() if node not in self.responses}
-            if not wanted:
-                return
-            place = np.full(3 * nx * ny * nz, -1)
-            place[self.free] = np.arange(len(self.free))
-            for a, b in sorted(wanted):
-                i, j = (TILE * first + np.arange(TILE) for first in (a, b))
-                tile = (i[i < nx, None] * ny + j[j < ny]).ravel()
-                rows = place[3 * nz * np.repeat(tile, 3) + np.tile(np.arange(3), len(tile))]
-                forces = np.zeros((len(self.free), len(rows)))
-                forces[rows[rows >= 0], np.flatnonzero(rows >= 0)] = 1.0
-                every = np.zeros((len(place), len(rows)), np.float32)
-                every[self.free] = self.factor.solve(forces)
-                self.responses.update({node: every[:, 3 * n : 3 * n + 3].copy() for n, node in enumerate(tile.tolist())})
+        i, j = (TILE * first + np.arange(TILE) for first in tile)
+        nodes = (i[i < nx, None] * ny + j[j < ny]).ravel()
+        place = np.full(3 * nx * ny * nz, -1)
+        place[self.free] = np.arange(len(self.free))
+        rows = place[3 * nz * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))]
+        forces = np.zeros((len(self.free), len(rows)))
+        forces[rows[rows >= 0], np.flatnonzero(rows >= 0)] = 1.0
+        every = np.zeros((len(rows), len(place)), np.float32)
+        every[:, self.free] = self.factor.solve(forces).T
+        return {node: every[3 * n : 3 * n + 3] for n, node in enumerate(nodes.tolist())}
 
     def moved_base(self, shifts: Array) -> Array:
         """Displacements : (nx, ny, nz, 3) mm of all nodes when those of the base are moved : (nx, ny, 3) mm."""
         every = np.zeros((*self.size, 3))
         every[:, :, -1] = shifts
         flat = every.reshape(-1)
-        with self.lock:
+        with self.lock, self.blas.limit(limits=1):
             flat[self.free] = self.factor.solve(-(self.coupling @ flat[self.held])[:, None])[:, 0]
         return every
 
@@ -199,18 +219,19 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
     np.add.at(share, (np.repeat(np.arange(len(face)), 4), at.ravel()), under.weights.ravel())
     rested = face - under.depth[:, None] * normal
     wanted = under.depth - (share @ base[:, :, 0].reshape(-1, 3)[nodes]) @ normal
-    with soft.lock, threadpool_limits(1):
-        soft.respond(nodes)
+    with soft.lock, soft.blas.limit(limits=1):
+        responses = soft.respond(nodes)
         surface = 3 * soft.size[2] * np.repeat(nodes, 3) + np.tile(np.arange(3), len(nodes))
-        compliance = np.stack([soft.responses[node][surface] for node in nodes.tolist()], axis=1)  # (3 k, k, 3)
-        compliance = compliance.astype(float).reshape(len(nodes), 3, len(nodes), 3)
+        compliance = np.stack([responses[node][:, surface] for node in nodes.tolist()]).astype(float)  # by a force on b, j
+        compliance = compliance.reshape(len(nodes), 3, len(nodes), 3)
         # (m, 3, m, 3) displacement of each point by a force on each other
-        skin = np.einsum("ma,aibj,nb->minj", share, compliance, share, optimize=True)
+        skin = np.einsum("ma,bjai,nb->minj", share, compliance, share, optimize=True)
         pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
         pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
         root = np.linalg.cholesky(pushed)
-    for _ in range(2):  # large displacements leave some of the depth
-        with soft.lock, threadpool_limits(1):
+    flow = spread(soft, base)
+    for again in (True, False):  # large displacements leave some of the depth
+        with soft.lock, soft.blas.limit(limits=1):
             force, _ = nnls(root.T, np.linalg.solve(root, wanted))
             forces = force[:, None] * normal
             if drag is not None and force.any():
@@ -218,10 +239,11 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
             moved = base.reshape(-1).copy()
             for node, push in zip(nodes.tolist(), share.T @ forces, strict=True):
                 if push.any():
-                    moved += soft.responses[node] @ push.astype(np.float32)
-        found = led_through(spread(soft, moved.reshape(base.shape)))
-        wanted = wanted + np.where(force > 0, ((face - moved_to(found, rested)) @ normal), 0)
-    return found
+                    moved += push.astype(np.float32) @ responses[node]
+        flow = spread(soft, moved.reshape(base.shape))
+        if again:
+            wanted = wanted + np.where(force > 0, (face - led_to(flow, rested)) @ normal, 0)
+    return led_through(flow)
 
 
 class _Under(NamedTuple):
@@ -331,45 +353,36 @@ def _label(first, end, labels, points, solids):
 
 
 def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
-    """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty."""
-    import skfem  # takes half a second, which bodies that keep their form do without
-    from skfem.helpers import ddot, div, eye, sym_grad, trace
+    """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty.
 
+    With the gradients g and h of two nodes' shares, `K_ij = mu (g.h delta_ij + g_j h_i - 2/3 g_i h_j) + k g_i h_j`, summed over
+    two Gauss's points along each axis.
+    """
     nx, ny, nz = (*mesh.skin.shape, len(LAYERS) + 1)
     number = np.arange(nx * ny * nz).reshape(nx, ny, nz)
-    corner = {(i, j, k): number[i : nx - 1 + i, j : ny - 1 + j, k : nz - 1 + k] for i in (0, 1) for j in (0, 1) for k in (0, 1)}
-    order = [(1, 1, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)]  # of scikit-fem's corners
-    kept = np.broadcast_to(mesh.kept[..., None], modulus.shape)
-    cells = np.stack([corner[place][kept] for place in order])
-    used = np.unique(cells)
-    compact = np.full(number.size, -1)
-    compact[used] = np.arange(len(used))
-    hexes = skfem.MeshHex(mesh.nodes().reshape(-1, 3)[used].T.copy(), compact[cells])
-    shear = modulus[kept] / 3
-    element = skfem.ElementVector(skfem.ElementHex1())
-
-    @skfem.BilinearForm
-    def deviatoric(u, v, w):
-        strain = sym_grad(u)
-        return 2 * w["shear"] * ddot(strain - eye(trace(strain) / 3, 3), sym_grad(v))
-
-    @skfem.BilinearForm
-    def volumetric(u, v, w):
-        return w["bulk"] * div(u) * div(v)
-
-    whole, middle = (skfem.Basis(hexes, element, intorder=order) for order in (2, 1))
-    each = {basis: shear[:, None] * np.ones((1, basis.dx.shape[1])) for basis in (whole, middle)}
-    bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))
-    matrix: Any = deviatoric.assemble(whole, shear=each[whole]) + volumetric.assemble(middle, bulk=bulk * each[middle])
-    places = np.empty(matrix.shape[0], np.int64)
-    numbers: Any = whole.nodal_dofs
-    places[numbers.T.ravel()] = (3 * used[:, None] + np.arange(3)).ravel()
-    found = matrix.tocoo()
-    size = 3 * number.size
-    return sparse.csr_matrix((found.data, (places[found.row], places[found.col])), (size, size))
+    corners = np.array(list(np.ndindex(2, 2, 2)))  # (8, 3)
+    nodes, total = mesh.nodes().reshape(-1, 3), sparse.csr_matrix((3 * number.size, 3 * number.size))
+    bulk = 2 * (1 + POISSON) / (3 * (1 - 2 * POISSON))  # over the shear modulus
+    for i in range(nx - 1):  # a plane of elements at once
+        kept = np.broadcast_to(mesh.kept[i, :, None], modulus.shape[1:])
+        cells = np.stack([number[i + p, q : ny - 1 + q, r : nz - 1 + r][kept] for p, q, r in corners.tolist()], axis=1)  # (n, 8)
+        shear, stiff = modulus[i][kept] / 3, np.zeros((len(cells), 8, 3, 8, 3))
+        for point in 0.5 + (corners - 0.5) / np.sqrt(3):
+            sides, signs = np.where(corners, point, 1 - point), 2.0 * corners - 1
+            slopes = np.stack([signs[:, n] * np.delete(sides, n, axis=1).prod(axis=1) for n in range(3)], axis=1)  # (8, 3)
+            lengths = np.einsum("cu,ncx->nux", slopes, nodes[cells])
+            gradient = np.einsum("nxu,cu->ncx", np.linalg.inv(lengths), slopes)
+            weight = shear * np.linalg.det(lengths) / 8
+            each = np.einsum("n,nai,nbj->naibj", weight, gradient, gradient, optimize=True)
+            stiff += each.transpose(0, 1, 4, 3, 2) + (bulk - 2 / 3) * each
+            stiff += np.einsum("naxbx,ij->naibj", each, np.eye(3))
+        rows = (3 * cells[..., None] + np.arange(3)).reshape(len(cells), 24)
+        places = np.repeat(rows, 24, axis=1).ravel(), np.tile(rows, (1, 24)).ravel()
+        total += sparse.csr_matrix((stiff.ravel(), places), total.shape)
+    return total
 
 
-def spread(soft: ElasticBody, moved: Array) -> Displacement:
+def spread(soft: ElasticBody, moved: Array) -> Flow:
     """Displacements of a body's nodes : (nx, ny, nz, 3) mm on a grid, as between the nodes; beyond the body as at its border."""
     mesh = soft.mesh
     first = np.array([mesh.x[0], mesh.y[0], mesh.skin.min() - GRID_MM])
@@ -377,7 +390,7 @@ def spread(soft: ElasticBody, moved: Array) -> Displacement:
     counts = np.ceil((last - first) / GRID_MM).astype(int) + 1
     found = np.zeros((*counts, 3), np.float32)
     in_threads(_spread, counts[0], found, np.ascontiguousarray(moved, float), mesh, mesh.shares, first, GRID_MM)
-    return displacement(first, GRID_MM, found)
+    return Flow(first, 1 / GRID_MM, found)
 
 
 @kernel

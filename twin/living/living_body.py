@@ -10,8 +10,9 @@ Sources: Lujan et al. 1999, Med. Phys. 26(5), for the breath's course in time.
 """
 
 from dataclasses import dataclass, replace
+from dataclasses import field as dataclass_field
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import trimesh
@@ -28,7 +29,8 @@ from twin.displacement import LEAST_STRETCH, NOWHERE, Displacement, led_through,
 from twin.living import elastic_body
 from twin.living.elastic_body import ElasticBody
 from twin.ultrasound.echo_solids import Body, Solid
-from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
+from twin.ultrasound.probe_path import FOOT
+from twin.ultrasound.scan_lines import lines_of, middle_of_face, world_from_face, world_from_lines
 from twin.ultrasound.sweep_session import SUPPORTS, surface_of
 from twin.ultrasound.transducer import Transducer
 
@@ -36,9 +38,7 @@ Array = NDArray[np.float64]
 Moments = NDArray[np.int64]
 
 STREAM = 17  # of random numbers, apart from others of a session
-FOOT_MM, LENS_RADIUS_MM = 14.0, 15.0  # of the probe's foot across the array, and of its rounding; assumed
-ENDS_MM, END_RADIUS_MM = 4.0, 6.0  # of the foot beyond the array at each end, and of its rounding there; assumed
-FOOT_POINTS = (17, 7)  # of it, along and across, that may touch the skin
+FOOT_POINTS = (17, 7)  # of the probe's foot, along and across, that may touch the skin
 BEATING_MM = 35.0  # standard deviation of the place over which the chest's wall beats; assumed
 PULSE = 0.12  # of a beat, over which the wall goes out and comes back; assumed
 STRIDE = 8  # pixels, of the truth that is kept
@@ -143,6 +143,13 @@ class LivingBody:
         return NOWHERE if by_heart is None else led_through(elastic_body.spread(self.soft, by_heart))
 
 
+class Met(NamedTuple):
+    """Points of the body when an image is taken, in its own frame."""
+
+    rested: NDArray[np.float32]  # (h, w, 3) mm, where each STRIDE-th pixel rests, by its true depth
+    centres: Array  # (k, 3) mm, of what is hidden
+
+
 @dataclass(frozen=True, eq=False)
 class LivingSweep:
     """A living body under a probe that is led over it."""
@@ -150,6 +157,7 @@ class LivingSweep:
     patient: LivingBody
     transducer: Transducer
     path: Track  # world_from_image over all of the sweep
+    met: dict[int, Met] = dataclass_field(init=False, default_factory=dict)  # by the moment, ns, of images that were taken
 
     def body_from_image(self, times: Moments, world_from_image: Array) -> Array:
         """Poses : (n, 4, 4) of images in the body's frame, in which it rests."""
@@ -168,6 +176,12 @@ class LivingSweep:
             )
         return found
 
+    def under_image(self, time: int, body_from_image: Array) -> Displacement:
+        """`field` when an image is taken, of which the truth is kept, so that no field is worked out twice."""
+        found = self.field(time, body_from_image)
+        self.met[time] = self._met(found, body_from_image)
+        return found
+
     def scene_at(self, scene: Scene, time: int) -> Scene:
         """The scene at a moment, ns, as cameras see it under the probe."""
         moment = np.array([time], np.int64)
@@ -177,31 +191,38 @@ class LivingSweep:
     def truth(self, times: Moments, world_from_image: Array) -> dict[str, Array]:
         """Truth of some images : where the chest stood, and where points of the body and middles of masses were and rest.
 
+        Of those that were taken, see `under_image`, no field is worked out again.
+
         Returns
         -------
         dict
             world_from_body (n, 4, 4) mm; rested_mm (n, h, w, 3): where in the body each STRIDE-th pixel rests, by its true depth;
             centres_mm (n, k, 3): in the world, of what is hidden; resting_centres_mm (k, 3) in the body, and names (k,).
         """
-        solids = [one for one in self.patient.body.solids if not one.is_layer and one.name not in SUPPORTS]
-        hidden = {one.name: one.mesh for one in solids if one is not self.patient.surface}
         poses, motion = self.body_from_image(times, world_from_image), self.patient.world_from_body(times)
-        width, height = self.transducer.image_size
-        sx, sy = self.transducer.scale_mm_per_px
-        x, y = np.meshgrid(sx * np.arange(0, width, STRIDE), sy * np.arange(0, height, STRIDE))
-        pixels = np.stack([x, y, np.zeros_like(x)], axis=-1)
-        rested, centres = [], []
-        for time, pose, carried in zip(times.tolist(), poses, motion, strict=True):
-            field = self.field(time, pose)
-            rested.append(np.float32(rested_at(field, rigid.apply(pose, pixels))))
-            centres.append([moved_mesh(mesh, carried, field).center_mass for mesh in hidden.values()])
+        moments = zip(times.tolist(), poses, strict=True)
+        met = [self.met.get(time) or self._met(self.field(time, pose), pose) for time, pose in moments]
+        centres = [rigid.apply(carried, one.centres) for carried, one in zip(motion, met, strict=True)]
         return {
             "world_from_body": motion,
-            "rested_mm": np.array(rested),
-            "centres_mm": np.array(centres).reshape(len(times), len(hidden), 3),
-            "resting_centres_mm": np.array([mesh.center_mass for mesh in hidden.values()]).reshape(-1, 3),
-            "names": np.array(list(hidden)),
+            "rested_mm": np.array([one.rested for one in met]),
+            "centres_mm": np.array(centres).reshape(len(times), len(self._hidden), 3),
+            "resting_centres_mm": np.array([mesh.center_mass for mesh in self._hidden.values()]).reshape(-1, 3),
+            "names": np.array(list(self._hidden)),
         }
+
+    @cached_property
+    def _hidden(self) -> dict[str, trimesh.Trimesh]:
+        """What lies in the body, by name."""
+        solids = [one for one in self.patient.body.solids if not one.is_layer and one.name not in SUPPORTS]
+        return {one.name: one.mesh for one in solids if one is not self.patient.surface}
+
+    def _met(self, found: Displacement, body_from_image: Array) -> Met:
+        (width, height), (sx, sy) = self.transducer.image_size, self.transducer.scale_mm_per_px
+        x, y = np.meshgrid(sx * np.arange(0, width, STRIDE), sy * np.arange(0, height, STRIDE))
+        pixels = np.stack([x, y, np.zeros_like(x)], axis=-1)
+        centres = [moved_mesh(mesh, np.eye(4), found).center_mass for mesh in self._hidden.values()]
+        return Met(np.float32(rested_at(found, rigid.apply(body_from_image, pixels))), np.array(centres).reshape(-1, 3))
 
     def _drag_at(self, time: int, normal: Array) -> Array | None:
         if not self.patient.living.drag_mm:
@@ -216,7 +237,7 @@ class LivingSweep:
         Skin follows the face until it is drawn out: a way ds adds `ds - |ds| d / most` to its displacement d.
         """
         poses = self.body_from_image(self.path.times, self.path.poses)
-        middle = (world_from_face(self.transducer, poses) @ np.append(_middle(self.transducer), 1.0))[:, :3]
+        middle = (world_from_face(self.transducer, poses) @ middle_of_face(self.transducer))[:, :3, 3]
         steps = np.diff(middle, axis=0, prepend=middle[:1])
         steps -= poses[:, :3, 1] * (steps * poses[:, :3, 1]).sum(axis=1, keepdims=True)
         drags, drawn = np.zeros_like(steps), np.zeros(3)
@@ -271,17 +292,13 @@ def _about(point: Array, rotation: Array) -> Array:
     return turn
 
 
-def _middle(transducer: Transducer) -> Array:
-    return np.array([transducer.face_mm[0] if transducer.face is None else 0.0, 0.0, 0.0])
-
-
 def _foot(transducer: Transducer, body_from_image: Array) -> tuple[Array, Array]:
     """Points of the probe's foot : (m, 3) mm, rounded across the array and at its ends, and the face's normal : (3,)."""
     lines = lines_of(transducer)
-    places = np.linspace(-ENDS_MM, 2 * lines.middle_mm + ENDS_MM, FOOT_POINTS[0])
-    across = FOOT_MM * np.linspace(-0.5, 0.5, FOOT_POINTS[1])
+    places = np.linspace(-FOOT.ends_mm, 2 * lines.middle_mm + FOOT.ends_mm, FOOT_POINTS[0])
+    across = FOOT.across_mm * np.linspace(-0.5, 0.5, FOOT_POINTS[1])
     beyond = np.maximum(np.abs(places - lines.middle_mm) - lines.middle_mm, 0)
-    back = beyond[:, None] ** 2 / (2 * END_RADIUS_MM) + across**2 / (2 * LENS_RADIUS_MM)
+    back = beyond[:, None] ** 2 / (2 * FOOT.end_radius_mm) + across**2 / (2 * FOOT.lens_radius_mm)
     poses = world_from_lines(lines, world_from_face(transducer, body_from_image), places)[:, None]
     points = poses[..., :3, 3] + across[:, None] * poses[..., :3, 2] - back[..., None] * poses[..., :3, 1]
     return points.reshape(-1, 3), body_from_image[:3, 1]

@@ -3,6 +3,7 @@ bottom; or from rest to rest about wires, or over a wall or a sphere.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -28,6 +29,24 @@ RATE_HZ = 100.0  # of the poses that make up a path
 MOST_S = 3600.0  # of a path
 Rest = Annotated[float, Field(ge=0, le=60)]  # s
 CALM = tremor.draw(0.0, 0.0, 0)  # a hand without tremor
+
+
+@dataclass(frozen=True)
+class Foot:
+    """The probe's foot, rounded across the array and beyond its ends; assumed.
+
+    A path brings its middle into contact with the surface at rest, over the array alone, flat to half a millimetre. Into tissue
+    that yields, all of it is pressed.
+    """
+
+    across_mm: float = 14.0  # of all of it, across the array
+    lens_radius_mm: float = 15.0  # of the rounding across
+    flat_mm: float = 8.0  # of its middle, across the array
+    ends_mm: float = 4.0  # beyond the array at each end
+    end_radius_mm: float = 6.0  # of the rounding there
+
+
+FOOT = Foot()
 
 
 class Hand(Part):
@@ -345,10 +364,9 @@ def _upright(turn_deg: float) -> Array:
 def _place(path: SurfacePath | Hold, place: Array, solid: Solid, transducer: Transducer) -> Array:
     """Pose of the face's middle : (4, 4), in contact at a place (x, y)."""
     axes = _upright(path.turn_deg)
-    foot_mm = 8.0  # width of the probe's foot across the array
     foot_points = (21, 5)  # of the foot, along and across the array
     along, across = np.meshgrid(
-        np.linspace(-0.5, 0.5, foot_points[0]) * transducer.foot_mm, np.linspace(-0.5, 0.5, foot_points[1]) * foot_mm
+        np.linspace(-0.5, 0.5, foot_points[0]) * transducer.foot_mm, np.linspace(-0.5, 0.5, foot_points[1]) * FOOT.flat_mm
     )
     foot = place + np.outer(along.ravel(), axes[:2, 0]) + np.outer(across.ravel(), axes[:2, 2])
     height = top(solid, foot)
@@ -366,7 +384,7 @@ def _place(path: SurfacePath | Hold, place: Array, solid: Solid, transducer: Tra
     turn = turn @ Rotation.from_euler("zx", [path.tilt_deg[0], path.tilt_deg[1]], degrees=True).as_matrix()
     surface = np.column_stack([foot[seen], height[seen]])
     middle = np.array([*place, level])
-    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.foot_mm / 2, foot_mm / 2]).all(axis=1)
+    under = (np.abs((surface - middle) @ turn[:, [0, 2]]) <= [transducer.foot_mm / 2, FOOT.flat_mm / 2]).all(axis=1)
     gap = ((surface - middle) @ turn[:, 1])[under].min()
     return rigid.transform(turn, middle + (gap - path.standoff_mm) * turn[:, 1])
 

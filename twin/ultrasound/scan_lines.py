@@ -50,6 +50,12 @@ def world_from_face(transducer: Transducer, world_from_image: Array) -> Array:
     return world_from_image @ rigid.transform(np.eye(3), (*transducer.face_mm, 0.0))
 
 
+def middle_of_face(transducer: Transducer) -> Array:
+    """Frame of the middle of the face in that of the face : (4, 4)."""
+    aside = transducer.face_mm[0] if transducer.face is None else 0.0
+    return rigid.transform(np.eye(3), [aside, 0.0, 0.0])
+
+
 def world_from_lines(lines: Lines, world_from_face: Array, along: Array) -> Array:
     """Poses (n, 4, 4) of lines at places : (n,) mm on the face: x along the face, y down the line, z across the plane."""
     poses = np.tile(np.eye(4), (len(along), 1, 1))

@@ -277,7 +277,7 @@ def _facet(ray, y, solids, solid, pose):
     nx, ny, nz = normal_at(solids, solid, x0, y0, z0)
     cosine = nx * ray.dx + ny * ray.dy + nz * ray.dz
     square = max(abs(cosine), 1e-6)
-    miss = distance_at(solids, solid, x0, y0, z0)
+    miss = distance_at(solids, solid, x0, y0, z0) / shrinking(solids)  # the distance itself, not the least
     depth = y - miss / cosine if abs(miss) < 0.1 and abs(cosine) > GLANCING else y
     slope_x = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) / square
     slope_z = (nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]) / square

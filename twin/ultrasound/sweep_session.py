@@ -236,15 +236,12 @@ def write_session(
     probe : of the capture; None where it is still to be calibrated.
     film : of the cameras, in which the poses are then still to be found; None where the poses are given.
     bodies : further ones, by name
-    living : truth of a body that lives, worked out when the images are written
+    living : truth of a body that lives, asked for when all images are taken
     reference_from_image : (n, 4, 4) mm, where its images are in its own frame; else as in the world
     """
     with session.write(_describe_sound(scene, body)) as (capture, truth):
         own = truth.own.relative_to(truth.folder)
         truth.write_arrays(str(own / POSES), {"world_from_image": planned.truth.poses, "times_ns": planned.truth.times})
-
-        if living is not None:
-            truth.write_arrays(str(own / LIVING), living())
 
         met = planned.truth.poses if reference_from_image is None else reference_from_image
         shown: dict[str, list[dict[str, NDArray]]] = {one: [] for one in bodies}
@@ -268,6 +265,8 @@ def write_session(
         name = session.part.partition("/")[2]
         track, tracks = (planned.track, {further: led.track for further, led in bodies.items()}) if film is None else (None, {})
         capture.add_sweep(times, images(), devices, track, name, session.purpose, tracks)
+        if living is not None:
+            truth.write_arrays(str(own / LIVING), living())
         for further, led in bodies.items():
             seen = {"times_ns": led.truth.times, "world_from_target": led.truth.poses}
             scanned = {"times_ns": led.scanned.times, "reference_from_target": led.scanned.poses}

@@ -156,6 +156,18 @@ def test_a_body_goes_along_with_its_base(soft):
 def test_responses_have_the_same_bits_in_any_order(soft):
     other = elastic_body.elastic_body(block(), block().solids[0], None)
     nodes = np.array([5 * soft.size[1] + 7, 9 * soft.size[1] + 3])
-    soft.respond(nodes)
-    other.respond(nodes[::-1])
-    assert all((soft.responses[node] == other.responses[node]).all() for node in nodes.tolist())
+    here, there = soft.respond(nodes), other.respond(nodes[::-1])
+    assert all((here[node] == there[node]).all() for node in nodes.tolist())
+
+
+def test_few_responses_are_kept_and_those_that_come_again_have_the_same_bits(soft, monkeypatch):
+    """Feet here and there, each on more tiles than are kept."""
+    monkeypatch.setattr(elastic_body, "KEPT", 6)
+    first, kept = elastic_body.press(soft, foot(2.0), DOWN), []
+    for aside in (-15.0, 15.0):
+        elastic_body.press(soft, foot(2.0) + np.array([aside, aside, 0.0]), DOWN)
+        kept.append(len(soft.responses))
+    again = elastic_body.press(soft, foot(2.0), DOWN)
+    assert max(kept) <= 6
+    assert (again.moved == first.moved).all()
+    assert (again.back == first.back).all()

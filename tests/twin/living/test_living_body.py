@@ -250,6 +250,23 @@ def test_truth_says_where_points_rest_and_are(pressed_sweep):
 
 
 @pytest.mark.slow
+def test_each_field_is_worked_out_once(rig, monkeypatch):
+    """Truth of images that were taken is that of none taken yet."""
+    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0)
+    planned = plan_sweep(settings(rig, living=living, clocks={"scanner_hz": 4.0}))
+    coarse = replace(planned.living, patient=replace(planned.living.patient, element_mm=8.0))
+    expected = replace(planned, living=coarse).truth()
+    pressed, press = [], elastic_body.press
+    monkeypatch.setattr(elastic_body, "press", lambda *given: pressed.append(1) or press(*given))
+    taken = replace(planned, living=replace(coarse))
+    assert len(list(taken.scans())) > 2
+    found = taken.truth()
+    assert len(pressed) == len(planned.plan.truth.times)
+    assert found.keys() == expected.keys()
+    assert all((found[name] == expected[name]).all() for name in expected)
+
+
+@pytest.mark.slow
 def test_a_yielding_body_is_never_in_the_probe(pressed_sweep):
     """The face stands 2 mm in the resting skin, and labels begin with the skin or gel, not within."""
     field, pose = pressed_sweep.field(1), pressed_sweep.body_from_image[1]
