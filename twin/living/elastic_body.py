@@ -1,14 +1,15 @@
 """A soft body on a hard base under a probe's face: linear elasticity by finite elements, with contact that only pushes.
 
 The body is meshed in columns along the world's z, from the skin that faces the cameras down to what holds it. Elements are
-trilinear hexahedra of nearly incompressible, isotropic tissue, integrated in full. The face is a set of points; a point that lies
-below the skin pushes it along the face's normal until it lies in the face, and none pulls:
+trilinear hexahedra of nearly incompressible, isotropic tissue; the change of volume counts in their middles alone, so that they
+don't lock (selective reduced integration). The face is a set of points; a point that lies below the skin pushes it along the
+face's normal until it lies in the face, and none pulls:
 
     f >= 0,  C f - d >= 0,  f (C f - d) = 0,
 
 with the compliance C of the skin at the points and their depths d below the resting skin: Signorini's conditions, solved as a
 non-negative least-squares problem.
-Sources: Hughes 2000, The Finite Element Method, 3; Wriggers 2006, Computational Contact Mechanics, 5.
+Sources: Hughes 2000, The Finite Element Method, 4.4 (reduced integration); Wriggers 2006, Computational Contact Mechanics, 5.
 """
 
 from dataclasses import dataclass, field
@@ -356,7 +357,7 @@ def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
     """Stiffness of all nodes : (3 n, 3 n), a node's x, y and z one after the other; those that no element has are empty.
 
     With the gradients g and h of two nodes' shares, `K_ij = mu (g.h delta_ij + g_j h_i - 2/3 g_i h_j) + k g_i h_j`, summed over
-    two Gauss's points along each axis.
+    two Gauss's points along each axis; the last part in an element's middle alone.
     """
     nx, ny, nz = (*mesh.skin.shape, len(LAYERS) + 1)
     number = np.arange(nx * ny * nz).reshape(nx, ny, nz)
@@ -367,15 +368,16 @@ def _stiffness(mesh: Mesh, modulus: Array) -> sparse.csr_matrix:
         kept = np.broadcast_to(mesh.kept[i, :, None], modulus.shape[1:])
         cells = np.stack([number[i + p, q : ny - 1 + q, r : nz - 1 + r][kept] for p, q, r in corners.tolist()], axis=1)  # (n, 8)
         shear, stiff = modulus[i][kept] / 3, np.zeros((len(cells), 8, 3, 8, 3))
-        for point in 0.5 + (corners - 0.5) / np.sqrt(3):
+        for point in np.vstack([0.5 + (corners - 0.5) / np.sqrt(3), [[0.5, 0.5, 0.5]]]):
             sides, signs = np.where(corners, point, 1 - point), 2.0 * corners - 1
             slopes = np.stack([signs[:, n] * np.delete(sides, n, axis=1).prod(axis=1) for n in range(3)], axis=1)  # (8, 3)
             lengths = np.einsum("cu,ncx->nux", slopes, nodes[cells])
             gradient = np.einsum("nxu,cu->ncx", np.linalg.inv(lengths), slopes)
-            weight = shear * np.linalg.det(lengths) / 8
-            each = np.einsum("n,nai,nbj->naibj", weight, gradient, gradient, optimize=True)
-            stiff += each.transpose(0, 1, 4, 3, 2) + (bulk - 2 / 3) * each
-            stiff += np.einsum("naxbx,ij->naibj", each, np.eye(3))
+            each = np.einsum("n,nai,nbj->naibj", shear * np.linalg.det(lengths), gradient, gradient, optimize=True)
+            if (point == 0.5).all():
+                stiff += bulk * each
+            else:
+                stiff += (each.transpose(0, 1, 4, 3, 2) - 2 / 3 * each + np.einsum("naxbx,ij->naibj", each, np.eye(3))) / 8
         rows = (3 * cells[..., None] + np.arange(3)).reshape(len(cells), 24)
         places = np.repeat(rows, 24, axis=1).ravel(), np.tile(rows, (1, 24)).ravel()
         total += sparse.csr_matrix((stiff.ravel(), places), total.shape)
