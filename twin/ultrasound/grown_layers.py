@@ -174,7 +174,7 @@ def uneven_at(uneven, first, per_mm, x, y, z):
     return uneven[i, j, k]
 
 
-@kernel
+@kernel(fastmath=True)
 def strand_at(strata, strands, first, per_mm, x, y, z):
     """Unevenness from strand to strand at a point of the world: of what lies along one face, from the same strand."""
     cell = cell_at(first, per_mm, strata.shape, x, y, z)
@@ -184,7 +184,7 @@ def strand_at(strata, strands, first, per_mm, x, y, z):
     return _tiled(strands, x / STRAND_STEPS_MM[0], y / STRAND_STEPS_MM[1], level / STRAND_STEPS_MM[2])
 
 
-@kernel
+@kernel(fastmath=True)
 def patch_at(strands, x, y, z):
     """Share of an even border's echo that a patch of it sends back: patches of 2 to 4 mm, some of them hardly any."""
     return np.float32(1 / (1 + np.exp(1.2 - 2.5 * _tiled(strands, x / PATCH_MM, y / PATCH_MM, z / PATCH_MM))))
@@ -194,4 +194,4 @@ def patch_at(strands, x, y, z):
 def _tiled(values, u, v, w):
     """The nearest of values that go over and over."""
     i, j, k = int(np.floor(u + 0.5)), int(np.floor(v + 0.5)), int(np.floor(w + 0.5))
-    return values[i % values.shape[0], j % values.shape[1], k % values.shape[2]]
+    return values[i % STRANDS[0], j % STRANDS[1], k % STRANDS[2]]

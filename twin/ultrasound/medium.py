@@ -354,7 +354,7 @@ def _uneven_strength(solids, lattice, label, places, n, scanner):
     return value
 
 
-@kernel
+@njit(inline="always")
 def _fibres(solids, solid, pose, x, y, z, fibres):
     """Amplitude of fibres along a layer's faces, brightest where sound meets them squarely: a Gaussian of WIDTH."""
     layer, grown = solid - solids.layers[0], solids.grown
