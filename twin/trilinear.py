@@ -48,3 +48,18 @@ def within(v, cell, n):
     far = (v[i + one, j, k, n] * (1 - c) + v[i + one, j, k + one, n] * c) * (1 - b)
     far += (v[i + one, j + one, k, n] * (1 - c) + v[i + one, j + one, k + one, n] * c) * b
     return near * (1 - a) + far * a
+
+
+@njit(inline="always")
+def slope_within(v, cell, n):
+    """The gradient of column n of a grid : (nx, ny, nz, m) in a cell, for steps from point to point."""
+    i, j, k, a, b, c = np.uint64(cell.i), np.uint64(cell.j), np.uint64(cell.k), cell.a, cell.b, cell.c
+    one, n = np.uint64(1), np.uint64(n)
+    p, q = v[i, j, k, n], v[i, j, k + one, n]
+    r, s = v[i, j + one, k, n], v[i, j + one, k + one, n]
+    t, u = v[i + one, j, k, n], v[i + one, j, k + one, n]
+    w, x = v[i + one, j + one, k, n], v[i + one, j + one, k + one, n]
+    along_a = ((t - p) * (1 - c) + (u - q) * c) * (1 - b) + ((w - r) * (1 - c) + (x - s) * c) * b
+    along_b = ((r - p) * (1 - c) + (s - q) * c) * (1 - a) + ((w - t) * (1 - c) + (x - u) * c) * a
+    along_c = ((q - p) * (1 - b) + (s - r) * b) * (1 - a) + ((u - t) * (1 - b) + (x - w) * b) * a
+    return along_a, along_b, along_c

@@ -1,10 +1,12 @@
 import numpy as np
+import pytest
 
 from twin.displacement import (
     NOWHERE,
     Flow,
     carried_along,
     carried_back,
+    cofactors,
     displacement,
     led_through,
     led_to,
@@ -48,6 +50,18 @@ def test_compiled_code_carries_points_alike(rng):
     back = np.array([carried_back(field.moved, field.back, *grid, *point) for point in points])
     np.testing.assert_allclose(along, moved_to(field, points), atol=1e-12)
     np.testing.assert_allclose(back, rested_at(field, points), atol=0.01)
+
+
+def test_small_steps_and_areas_become_those_between_points_close_by(rng):
+    """Within a cell the field bends little over 1e-4 mm; a step that crosses into the next one is left out."""
+    field, h = dented(), 1e-4
+    places = FIRST + STEP * (rng.integers(2, 12, (100, 3)) + rng.uniform(0.1, 0.9, (100, 3)))
+    for place in places:
+        *rows, volume = cofactors(field.moved, field.first, field.per_mm, *place)
+        steps = (moved_to(field, place + h * np.eye(3)) - moved_to(field, place)) / h  # a row for a step along each axis
+        np.testing.assert_allclose(np.array(rows) @ steps.T / volume, np.eye(3), atol=2e-3)
+        assert volume == pytest.approx(np.linalg.det(steps), abs=2e-3)
+        np.testing.assert_allclose(rows[0], np.cross(steps[1], steps[2]), atol=2e-3)
 
 
 def test_beyond_its_grid_a_field_is_that_of_the_border():

@@ -5,8 +5,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
+from scipy import fft
+from scipy.signal import fftconvolve, lfilter
+from scipy.signal.windows import gaussian
 
 from recon.compiled import kernel
 from recon.threads import in_threads
@@ -27,39 +28,42 @@ def envelope(echoes: Field, transducer: Transducer, beam: Beam, paths: Paths, rn
 
     Looks of several bands and directions are averaged by power.
     """
-    picture, gain = transducer.picture, gain_over_depth(transducer, beam).astype(np.float32)[:, None]
-    ringing, power = (
-        face(transducer).astype(np.float32)[:, None],
-        np.zeros((len(beam.axial), lines_of(transducer).count), np.float32),
-    )
+    picture, looks = transducer.picture, transducer.picture.bands * transducer.picture.angles
+    gain, ringing = gain_over_depth(transducer, beam).astype(np.float32), face(transducer).astype(np.float32)
+    power = np.zeros((len(beam.axial), lines_of(transducer).count), np.float32)
+    shares = _shares_of_focus(transducer, beam, paths)
     grain = noise(transducer, beam, rng)  # of one look; others have it elsewhere
     for band in range(picture.bands):
         pulses = in_depth(echoes, beam.axial if picture.bands == 1 else part_of_band(beam, transducer, band))
+        spectrum = fft.fft(pulses)
         for angle in range(picture.angles):
-            received = _focused(pulses, transducer, beam, paths, angle)
-            received += np.roll(grain, (band * picture.angles + angle) * len(grain) // (picture.bands * picture.angles), axis=0)
-            received *= gain
-            received += ringing
-            power += received.real**2 + received.imag**2
-    power /= picture.bands * picture.angles
+            received = fft.ifft(spectrum * _spectra(transducer, angle))
+            shift = (band * picture.angles + angle) * len(grain) // looks
+            in_threads(_add_power, len(power), power, received, shares, grain, shift, gain, ringing)
+    power /= looks
     return np.sqrt(power if picture.clutter_db == -100 else power + _clutter(power, transducer, rng))
 
 
-def _focused(pulses: Field, transducer: Transducer, beam: Beam, paths: Paths, angle: int) -> Field:
-    """Echoes of one look after the beam : (rows, lines), with what tissues on the way have spoilt of its focus."""
-    lateral = steered(beam.lateral, transducer, angle)
-    sharp = along(pulses, lateral, beam.reach)
+def _shares_of_focus(transducer: Transducer, beam: Beam, paths: Paths) -> NDArray[np.float32]:
+    """Amplitude of the sharp beam : (1, rows, lines); of several rays also of the blunt one, as tissues leave of it."""
     if transducer.aperture_rays == 1:
-        return sharp
+        return np.ones((1, len(beam.lateral), len(paths.focus)), np.float32)
     wide = blunt(transducer)
-    row = np.minimum(np.arange(len(sharp)), paths.focus.shape[1] - 1)
+    row = np.minimum(np.arange(len(beam.lateral)), paths.focus.shape[1] - 1)
     focus = paths.focus[:, row].T
-    blurred = along(pulses, steered(wide.lateral, transducer, angle), wide.reach)
-    blurred *= np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
     inner, energies = (beam.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(beam.lateral) ** 2).sum(axis=1)
-    alike = (inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1)))[:, None]  # of the same scatterers
-    both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike).astype(np.float32)
-    return (np.sqrt(focus) * sharp + np.sqrt(1 - focus) * blurred) / both * paths.edges[:, row].T
+    alike = inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1))  # of the same scatterers
+    both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike.astype(np.float32)[:, None])
+    evened = np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
+    return np.stack([np.sqrt(focus), evened * np.sqrt(1 - focus)]) / both * paths.edges[:, row].T
+
+
+@lru_cache(maxsize=16)
+def _spectra(transducer: Transducer, angle: int) -> Field:
+    """Spectra along the array of the sharp point spread of a look, and of the blunt one of several rays : (1 | 2, rows, n)."""
+    beams = [beam_of(transducer)] if transducer.aperture_rays == 1 else [beam_of(transducer), blunt(transducer)]
+    count = lines_of(transducer).count + beams[0].lateral.shape[1] - 1
+    return np.stack([_spectrum_along(steered(one.lateral, transducer, angle), one.reach, count) for one in beams])
 
 
 @lru_cache(maxsize=8)
@@ -97,8 +101,10 @@ def _clutter(power: NDArray[np.float32], transducer: Transducer, rng: np.random.
     """Power of what is smeared along the array, and trails in depth, with speckle of its own."""
     picture, sx, sy = transducer.picture, lines_of(transducer).pitch_mm, transducer.scale_mm_per_px[1]
     trail_mm = 3.0  # by which echoes between layers trail behind
-    smeared = gaussian_filter1d(power, picture.clutter_mm / sx, axis=1, mode="nearest", truncate=3)
-    decay = np.exp(-sy / trail_mm)
+    reach = int(3 * picture.clutter_mm / sx + 0.5)
+    weights = gaussian(2 * reach + 1, picture.clutter_mm / sx).astype(np.float32)
+    padded = np.pad(power, [(0, 0), (reach, reach)], mode="edge")
+    decay, smeared = np.exp(-sy / trail_mm), fftconvolve(padded, weights[None] / weights.sum(), mode="valid", axes=1)
     smeared = np.asarray(lfilter([1 - decay], [1, -decay], smeared, axis=0))
     grain = rng.exponential(size=(len(power) // 2 + 1, power.shape[1] // 4 + 1)).astype(np.float32)
     grain = cv2.resize(grain, power.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0)
@@ -123,21 +129,23 @@ def image(share: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint
 
 def focused(field: Field, beam: Beam) -> Field:
     """Echoes after pulse and beam : (h, w), from a field of echoes at their places: the coherent sum."""
-    return along(in_depth(field, beam.axial), beam.lateral, beam.reach)
+    pulses = in_depth(field, beam.axial)
+    count = len(field) - beam.lateral.shape[1] + 1
+    return fft.ifft(fft.fft(pulses) * _spectrum_along(beam.lateral, beam.reach, len(field)))[:, :count]
 
 
 def in_depth(field: Field, axial: NDArray) -> Field:
     """Echoes after the pulse : (rows, lines)."""
     pulses = np.zeros((len(axial), len(field)), np.complex64)
-    in_threads(_in_depth, len(field), pulses, field, axial)
+    in_threads(_in_depth, len(axial), pulses, np.ascontiguousarray(field.T), axial)
     return pulses
 
 
-def along(pulses: Field, lateral: Field, reach: NDArray[np.int64]) -> Field:
-    """Echoes after the beam along the array : (rows, lines)."""
-    focused = np.zeros((len(pulses), pulses.shape[1] - lateral.shape[1] + 1), np.complex64)
-    in_threads(_along, len(pulses), focused, pulses, lateral, reach)
-    return focused
+def _spectrum_along(lateral: Field, reach: NDArray[np.int64], count: int) -> Field:
+    """Spectrum : (rows, n) of the point spread along the array, for n lines with room for its width."""
+    half = lateral.shape[1] // 2
+    within = np.abs(np.arange(-half, half + 1)) <= reach[:, None]
+    return fft.ifft(lateral * within, count, norm="forward")
 
 
 def _reference_power(transducer: Transducer, beam: Beam) -> Array:
@@ -187,23 +195,25 @@ def grey(share: NDArray[np.float32], transducer: Transducer) -> NDArray[np.uint8
 
 
 @kernel(fastmath=True)
-def _in_depth(first, end, pulses, field, axial):
-    rows, taps = axial.shape
-    reach, samples = taps // 2, field.shape[1]
-    for line in range(first, end):
-        for r in range(rows):
-            total = np.complex64(0)
-            middle = OVERSAMPLING * r
-            for t in range(max(0, reach - middle), min(taps, samples - middle + reach)):
-                total += axial[r, t] * field[line, middle + t - reach]
-            pulses[r, line] = total
+def _in_depth(first, end, pulses, samples, axial):
+    """Sum the echoes of samples : (OVERSAMPLING rows, lines) over the pulse of some rows."""
+    taps = axial.shape[1]
+    for r in range(first, end):
+        start = OVERSAMPLING * r - taps // 2
+        for t in range(max(0, -start), min(taps, len(samples) - start)):
+            weight = axial[r, t]
+            for line in range(pulses.shape[1]):
+                pulses[r, line] += weight * samples[start + t, line]
 
 
 @kernel(fastmath=True)
-def _along(first, end, focused, pulses, lateral, reach):
-    half = lateral.shape[1] // 2
+def _add_power(first, end, power, received, shares, grain, shift, gain, ringing):
+    """Add the power of one look to some rows: of all beams' echoes, the noise, and the face."""
     for r in range(first, end):
-        for t in range(half - reach[r], half + reach[r] + 1):
-            weight = lateral[r, t]
-            for x in range(focused.shape[1]):
-                focused[r, x] += weight * pulses[r, x + t]
+        noisy = grain[r - shift]
+        for x in range(power.shape[1]):
+            echo = noisy[x]
+            for beam in range(len(shares)):
+                echo += shares[beam, r, x] * received[beam, r, x]
+            echo = gain[r] * echo + ringing[r]
+            power[r, x] += echo.real * echo.real + echo.imag * echo.imag

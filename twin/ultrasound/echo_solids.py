@@ -23,7 +23,7 @@ from scenes.scene_types import Layers, Scene, Thing
 from scenes.tissue import Tissue
 from twin import conditions
 from twin.conditions import Sound
-from twin.displacement import NOWHERE, Displacement, carried_back
+from twin.displacement import NOWHERE, Displacement, carried_back, cofactors
 from twin.ultrasound.grown_layers import NONE, Grown, layer_at, layer_distance, packed
 from twin.ultrasound.mesh_distance import Grid, signed_distances
 
@@ -293,6 +293,34 @@ def resting_place(solids, x, y, z):
 
 
 @njit(inline="always")
+def turned(solids, nx, ny, nz, x, y, z):
+    """A normal at a place of a body at rest, as the displacement has turned it; of length 1."""
+    if is_displaced(solids):
+        a, b, c, _ = cofactors(solids.field.moved, solids.field.first, solids.field.per_mm, x, y, z)
+        nx, ny, nz = (
+            nx * a[0] + ny * b[0] + nz * c[0],
+            nx * a[1] + ny * b[1] + nz * c[1],
+            nx * a[2] + ny * b[2] + nz * c[2],
+        )
+        size = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
+        nx, ny, nz = nx / size, ny / size, nz / size
+    return nx, ny, nz
+
+
+@njit(inline="always")
+def resting_step(solids, dx, dy, dz, x, y, z):
+    """A small step from where a place of a body rested, as it was at rest."""
+    if is_displaced(solids):
+        a, b, c, volume = cofactors(solids.field.moved, solids.field.first, solids.field.per_mm, x, y, z)
+        dx, dy, dz = (
+            (a[0] * dx + a[1] * dy + a[2] * dz) / volume,
+            (b[0] * dx + b[1] * dy + b[2] * dz) / volume,
+            (c[0] * dx + c[1] * dy + c[2] * dz) / volume,
+        )
+    return dx, dy, dz
+
+
+@njit(inline="always")
 def resting_distance(solids, solid, x, y, z):
     """Signed distance of one solid, at rest, at a point."""
     first, end = solids.layers
@@ -355,7 +383,7 @@ def resting_label(solids, x, y, z, beside=0.0):
     for k in range(len(solids.grid) - 1, -1, -1):
         if first <= k < end:
             if k == end - 1:
-                layer = layer_at(grown.sure, grown.distance, grown.half_mm, grown.first, grown.per_mm, x, y, z)
+                layer = layer_at(grown.sure, grown.among, grown.distance, grown.half_mm, grown.first, grown.per_mm, x, y, z)
                 if layer != NONE:
                     return first + layer + 1
         elif own_distance(solids, k, x, y, z) <= (beside * MARGINS_MM[int(solids.mirrors[k])] if first < end <= k else 0.0):

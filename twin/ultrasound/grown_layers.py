@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from recon.compiled import kernel, njit
 from scenes.scene_types import Layer, Layers
-from twin.trilinear import cell_at, within
+from twin.trilinear import cell_at, nearest_cell, slope_within, within
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,7 @@ class Grown(NamedTuple):
 
     distance: NDArray[np.float32]  # (nx, ny, nz, layers) mm, negative inside; of a sheet, its sides have two signs
     sure: NDArray[np.int8]  # (nx - 1, ny - 1, nz - 1) the layer that holds a whole cell, NONE or MIXED
+    among: NDArray[np.uint32]  # as `sure`, of a mixed cell the layers that may hold its points, a bit each; see `_bit`
     half_mm: NDArray[np.float32]  # (layers,) half the thickness of those that are sheets, 0 of others
     first: Array  # (3,) mm in the world, the first grid point
     per_mm: float  # grid points
@@ -42,13 +43,21 @@ def packed(layers: Layers | None) -> Grown:
     if layers is None:
         empty = np.zeros((0, 0, 0), np.float32)
         return Grown(
-            empty[..., None], empty.astype(np.int8), np.zeros(0, np.float32), np.zeros(3), 1.0, empty, empty[..., None], empty
+            empty[..., None],
+            empty.astype(np.int8),
+            empty.astype(np.uint32),
+            np.zeros(0, np.float32),
+            np.zeros(3),
+            1.0,
+            empty,
+            empty[..., None],
+            empty,
         )
     distance = np.stack([one.distance for one in layers.layers], axis=-1)
     half = np.array([one.half_mm for one in layers.layers], np.float32)
     uneven = np.exp(layers.uneven_db * np.float32(np.log(10) / 20))
     place = np.asarray(layers.origin, float), 1 / layers.step_mm
-    return Grown(distance, _sure(layers.layers), half, *place, uneven, layers.strata_mm[..., None], _strands())
+    return Grown(distance, *_in_cells(layers.layers), half, *place, uneven, layers.strata_mm[..., None], _strands())
 
 
 @cache
@@ -63,21 +72,31 @@ def _strands() -> NDArray[np.float32]:
     return total / total.std()
 
 
-def _sure(layers: Sequence[Layer]) -> NDArray[np.int8]:
-    """The layer that holds each cell : (nx - 1, ny - 1, nz - 1); within a cell, distances lie between those of its corners."""
+@njit(inline="always")
+def _bit(layer):
+    """The bit of a layer; those from the 31st on share one."""
+    return np.uint32(1) << np.uint32(min(layer, 31))
+
+
+def _in_cells(layers: Sequence[Layer]) -> tuple[NDArray[np.int8], NDArray[np.uint32]]:
+    """`sure` and `among` of each cell : (nx - 1, ny - 1, nz - 1); within it, distances lie between those of its corners."""
     shape = np.subtract(layers[0].distance.shape, 1)
     found, outside, partly = np.full(shape, NONE, np.int8), np.zeros(shape, bool), np.zeros(shape, bool)
+    among = np.zeros(shape, np.uint32)
     for k, layer in enumerate(layers):
         low, high = (_of_corners(layer.distance, bound) for bound in (np.minimum, np.maximum))
         holds = (low >= -layer.half_mm) & (high <= layer.half_mm) if layer.half_mm else high <= 0
         lacks = (low > layer.half_mm) | (high < -layer.half_mm) if layer.half_mm else low > 0
         found[holds] = k
         found[~holds & ~lacks] = MIXED
+        among[holds] = 0  # what lies below
+        among[~lacks] |= _bit.py_func(k)
         if k == 0:
             outside, partly = lacks, ~holds & ~lacks
     found[outside] = NONE
     found[partly] = MIXED
-    return found
+    among[partly] |= _bit.py_func(0)
+    return found, among
 
 
 def _of_corners(values: NDArray[np.float32], bound: np.ufunc) -> NDArray[np.float32]:
@@ -89,7 +108,7 @@ def _of_corners(values: NDArray[np.float32], bound: np.ufunc) -> NDArray[np.floa
 
 
 @kernel
-def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
+def layer_at(sure, among, distance, half_mm, first, per_mm, x, y, z):
     """The last layer that holds a point of the world, or NONE."""
     cell = cell_at(first, per_mm, distance.shape, x, y, z)
     if cell.i < 0:
@@ -97,12 +116,14 @@ def layer_at(sure, distance, half_mm, first, per_mm, x, y, z):
     whole = sure[cell.i, cell.j, cell.k]
     if whole != MIXED:
         return whole
-    if within(distance, cell, 0) > 0:
+    some = among[cell.i, cell.j, cell.k]
+    if some & _bit(0) and within(distance, cell, 0) > 0:
         return NONE
     for layer in range(len(half_mm) - 1, -1, -1):
-        d, half = within(distance, cell, layer), half_mm[layer]
-        if (abs(d) if half > 0 else d) <= half:
-            return layer
+        if some & _bit(layer):
+            d, half = within(distance, cell, layer), half_mm[layer]
+            if (abs(d) if half > 0 else d) <= half:
+                return layer
     return NONE
 
 
@@ -130,6 +151,14 @@ def layer_normal(distance, half_mm, first, per_mm, layer, x, y, z, step_mm):
 
 
 @kernel
+def layer_slope(distance, first, per_mm, layer, x, y, z):
+    """Direction across a layer at a point of the world, to either side: the gradient in its cell, or in the nearest."""
+    a, b, c = slope_within(distance, nearest_cell(first, per_mm, distance.shape, x, y, z), layer)
+    size = np.sqrt(a * a + b * b + c * c) + 1e-12
+    return a / size, b / size, c / size
+
+
+@kernel
 def _side(distance, first, per_mm, layer, x, y, z):
     """Distance to a layer, of a sheet to its middle, with its sides' signs."""
     cell = cell_at(first, per_mm, distance.shape, x, y, z)
@@ -145,7 +174,7 @@ def uneven_at(uneven, first, per_mm, x, y, z):
     return uneven[i, j, k]
 
 
-@kernel
+@kernel(fastmath=True)
 def strand_at(strata, strands, first, per_mm, x, y, z):
     """Unevenness from strand to strand at a point of the world: of what lies along one face, from the same strand."""
     cell = cell_at(first, per_mm, strata.shape, x, y, z)
@@ -155,7 +184,7 @@ def strand_at(strata, strands, first, per_mm, x, y, z):
     return _tiled(strands, x / STRAND_STEPS_MM[0], y / STRAND_STEPS_MM[1], level / STRAND_STEPS_MM[2])
 
 
-@kernel
+@kernel(fastmath=True)
 def patch_at(strands, x, y, z):
     """Share of an even border's echo that a patch of it sends back: patches of 2 to 4 mm, some of them hardly any."""
     return np.float32(1 / (1 + np.exp(1.2 - 2.5 * _tiled(strands, x / PATCH_MM, y / PATCH_MM, z / PATCH_MM))))
@@ -165,4 +194,4 @@ def patch_at(strands, x, y, z):
 def _tiled(values, u, v, w):
     """The nearest of values that go over and over."""
     i, j, k = int(np.floor(u + 0.5)), int(np.floor(v + 0.5)), int(np.floor(w + 0.5))
-    return values[i % values.shape[0], j % values.shape[1], k % values.shape[2]]
+    return values[i % STRANDS[0], j % STRANDS[1], k % STRANDS[2]]

@@ -23,8 +23,9 @@ from twin.ultrasound.echo_solids import (
     is_displaced,
     resting_distance,
     resting_label,
+    turned,
 )
-from twin.ultrasound.grown_layers import layer_normal, strand_at, uneven_at
+from twin.ultrasound.grown_layers import layer_normal, layer_slope, strand_at, uneven_at
 from twin.ultrasound.scan_lines import on_lines, widening
 from twin.ultrasound.sound_paths import GRADIENT_MM, Paths
 from twin.ultrasound.transducer import Transducer
@@ -167,9 +168,10 @@ def _places_in_slice(places, cell, solids, lattice, scanner, beam, paths):
         if label >= 0 and lattice.strength[label] == 0:
             continue
         _hash_places(places, found, cell, start, lattice, scanner.seed)
+        end = found + min(RUN, high + 1 - start)
         if displaced:
-            _carry(places, found, found + RUN, solids.field, lattice.face_from_world, scanner.world_from_face)
-        for n in range(found, found + min(RUN, high + 1 - start)):
+            _carry(places, found, end, solids.field, lattice.face_from_world, scanner.world_from_face)
+        for n in range(found, end):
             x, y, z = places[X, n], places[Y, n], places[Z, n]
             along, depth = on_lines(x, y, scanner.bend, scanner.middle_mm)
             inside = 0 <= depth < scanner.deepest_mm and -BESIDE_MM <= along <= right
@@ -346,35 +348,21 @@ def _uneven_strength(solids, lattice, label, places, n, scanner):
     value *= uneven_at(grown.uneven, grown.first, grown.per_mm, wx, wy, wz)
     if spread > 0:  # of the tissue's mean power
         strand = strand_at(grown.strata, grown.strands, grown.first, grown.per_mm, wx, wy, wz)
-        value *= np.float32(np.exp(spread * (strand - spread)))
+        value *= np.exp(np.float32(spread * (strand - spread)))
     if fibres > 0 and solids.layers[0] < label <= solids.layers[1]:
         value *= _fibres(solids, label - 1, pose, wx, wy, wz, fibres)
     return value
 
 
-@kernel
+@njit(inline="always")
 def _fibres(solids, solid, pose, x, y, z, fibres):
     """Amplitude of fibres along a layer's faces, brightest where sound meets them squarely: a Gaussian of WIDTH."""
     layer, grown = solid - solids.layers[0], solids.grown
-    nx, ny, nz = layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, GRADIENT_MM)
-    if is_displaced(solids):
-        nx, ny, nz = _turned(solids.field, nx, ny, nz, x, y, z)
+    if grown.half_mm[layer] > 0:  # sheets bend within a cell
+        nx, ny, nz = layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, GRADIENT_MM)
+    else:
+        nx, ny, nz = layer_slope(grown.distance, grown.first, grown.per_mm, layer, x, y, z)
+    nx, ny, nz = turned(solids, nx, ny, nz, x, y, z)
     cosine = nx * pose[0, 1] + ny * pose[1, 1] + nz * pose[2, 1]
-    return np.float32(np.exp(fibres * np.exp((cosine * cosine - 1) / (2 * WIDTH**2))))
-
-
-@kernel
-def _turned(field, nx, ny, nz, x, y, z):
-    """A normal at a place of a body at rest, as the displacement has turned it: `n - grad(u) n`, to first order."""
-    h, moved, first, per_mm = 1.0, field.moved, field.first, field.per_mm
-    ax, ay, az = carried_along(moved, first, per_mm, x + h, y, z)
-    bx, by, bz = carried_along(moved, first, per_mm, x - h, y, z)
-    tx = nx - (nx * (ax - bx - 2 * h) + ny * (ay - by) + nz * (az - bz)) / (2 * h)
-    ax, ay, az = carried_along(moved, first, per_mm, x, y + h, z)
-    bx, by, bz = carried_along(moved, first, per_mm, x, y - h, z)
-    ty = ny - (nx * (ax - bx) + ny * (ay - by - 2 * h) + nz * (az - bz)) / (2 * h)
-    ax, ay, az = carried_along(moved, first, per_mm, x, y, z + h)
-    bx, by, bz = carried_along(moved, first, per_mm, x, y, z - h)
-    tz = nz - (nx * (ax - bx) + ny * (ay - by) + nz * (az - bz - 2 * h)) / (2 * h)
-    size = np.sqrt(tx * tx + ty * ty + tz * tz)
-    return tx / size, ty / size, tz / size
+    square = np.float32((cosine * cosine - 1) / (2 * WIDTH**2))
+    return np.exp(np.float32(fibres) * np.exp(square))

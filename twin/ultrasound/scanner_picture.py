@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import gaussian_filter
 
 from recon.model.rig import NotNegative, Part
 
@@ -137,5 +137,6 @@ def _interpolated(share: Image, columns: float) -> Image:
     count = max(round((width - 1) / columns) + 1, 2)
     lines = np.rint(np.linspace(0, width - 1, count)).astype(int)
     places = np.interp(np.arange(width), lines, np.arange(count))
-    rows = np.broadcast_to(np.arange(len(share))[:, None], share.shape)
-    return map_coordinates(share[:, lines], [rows, np.broadcast_to(places, share.shape)], order=1, mode="nearest")
+    before = np.minimum(places.astype(int), count - 2)
+    low, high = share[:, lines[before]], share[:, lines[before + 1]]
+    return low + (places - before).astype(np.float32) * (high - low)

@@ -17,13 +17,13 @@ from twin.ultrasound.echo_solids import (
     Body,
     between,
     distance_at,
-    is_displaced,
     is_sheet,
     label_at,
     own_distance,
     resting_distance,
     resting_place,
     shrinking,
+    turned,
 )
 from twin.ultrasound.grown_layers import layer_normal
 from twin.ultrasound.scan_lines import lines_of, world_from_face, world_from_lines
@@ -107,10 +107,16 @@ def low_frequencies(absorbed, spread):
 
 @njit(inline="always")
 def normal_at(solids, solid, x, y, z):
-    """Outward normal of a solid at a point of the world, from central differences."""
+    """Outward normal of a solid at a point of the world."""
+    x, y, z = resting_place(solids, x, y, z)
+    nx, ny, nz = resting_normal(solids, solid, x, y, z)
+    return turned(solids, nx, ny, nz, x, y, z)
+
+
+@njit(inline="always")
+def resting_normal(solids, solid, x, y, z):
+    """Outward normal of a solid, at rest, at a point, from central differences."""
     h, grown = GRADIENT_MM, solids.grown
-    if is_displaced(solids):
-        return _displaced_normal(solids, solid, x, y, z)
     if solids.layers[0] <= solid < solids.layers[1]:
         layer = solid - solids.layers[0]
         return layer_normal(grown.distance, grown.half_mm, grown.first, grown.per_mm, layer, x, y, z, h)
@@ -119,19 +125,6 @@ def normal_at(solids, solid, x, y, z):
     c = own_distance(solids, solid, x, y, z + h) - own_distance(solids, solid, x, y, z - h)
     size = np.sqrt(a * a + b * b + c * c) + 1e-12
     return a / size, b / size, c / size
-
-
-@kernel
-def _displaced_normal(solids, solid, x, y, z):
-    """Outward normal of a solid of a displaced body, from differences of distances at rest: the gradient is the world's."""
-    nx = ny = nz = 0.0
-    for side in range(6):
-        step = GRADIENT_MM if side % 2 else -GRADIENT_MM
-        axis = side // 2
-        d = distance_at(solids, solid, x + step * (axis == 0), y + step * (axis == 1), z + step * (axis == 2)) / step
-        nx, ny, nz = nx + d * (axis == 0), ny + d * (axis == 1), nz + d * (axis == 2)
-    size = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-12
-    return nx / size, ny / size, nz / size
 
 
 @njit(inline="always")

@@ -15,11 +15,20 @@ from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
 from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, laid, scanner_at, slab
-from twin.ultrasound.echo_solids import Body, Wire, distance_at, label_at, resting_distance, resting_place, shrinking
+from twin.ultrasound.echo_solids import (
+    Body,
+    Wire,
+    resting_distance,
+    resting_label,
+    resting_place,
+    resting_step,
+    shrinking,
+    turned,
+)
 from twin.ultrasound.grown_layers import patch_at
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
-from twin.ultrasound.sound_paths import Paths, normal_at, reflection, table_at
+from twin.ultrasound.sound_paths import Paths, reflection, resting_normal, table_at
 from twin.ultrasound.transducer import Transducer
 
 Array = NDArray[np.float64]
@@ -271,13 +280,21 @@ def _in_slice(y, z, repeats, beam):
 
 
 @njit(inline="always")
-def _facet(ray, y, solids, solid, pose):
+def _at_rest(ray, t, solids):
+    """A ray at a depth as it was at rest: its place there, and its steps."""
+    x, y, z = resting_place(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+    dx, dy, dz = resting_step(solids, ray.dx, ray.dy, ray.dz, x, y, z)
+    return _Ray(ray.along, ray.across, x, y, z, dx, dy, dz)
+
+
+@njit(inline="always")
+def _facet(ray, rested, y, solids, solid, pose):
     """Depth of a solid's border on a ray, cosine to its normal, and slopes along the array and across the plane."""
-    x0, y0, z0 = ray.x + ray.dx * y, ray.y + ray.dy * y, ray.z + ray.dz * y
-    nx, ny, nz = normal_at(solids, solid, x0, y0, z0)
+    nx, ny, nz = resting_normal(solids, solid, rested.x, rested.y, rested.z)
+    nx, ny, nz = turned(solids, nx, ny, nz, rested.x, rested.y, rested.z)
     cosine = nx * ray.dx + ny * ray.dy + nz * ray.dz
     square = max(abs(cosine), 1e-6)
-    miss = distance_at(solids, solid, x0, y0, z0) / shrinking(solids)  # the distance itself, not the least
+    miss = resting_distance(solids, solid, rested.x, rested.y, rested.z)
     depth = y - miss / cosine if abs(miss) < 0.1 and abs(cosine) > GLANCING else y
     slope_x = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) / square
     slope_z = (nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]) / square
@@ -285,9 +302,9 @@ def _facet(ray, y, solids, solid, pose):
 
 
 @kernel
-def _label_on(ray, solids, t):
-    """Label at a depth of a ray."""
-    return label_at(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+def _label_on(rested, solids, t):
+    """Label some mm on along a ray at rest."""
+    return resting_label(solids, rested.x + rested.dx * t, rested.y + rested.dy * t, rested.z + rested.dz * t)
 
 
 @njit(inline="always")
@@ -295,12 +312,13 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
     """Lay the echo of a border's facet, and its repeats between border and face."""
     here, there, solid = int(crossing[FROM]), int(crossing[TO]), int(max(crossing[FROM], crossing[TO])) - 1
     depth = crossing[DEPTH]
-    y, square, slope_x, slope_z = _facet(ray, depth, solids, solid, pose)
+    rested = _at_rest(ray, depth, solids)
+    y, square, slope_x, slope_z = _facet(ray, rested, depth, solids, solid, pose)
     if square <= GLANCING:
         return
     if solids.layers[0] < solids.layers[1]:  # borders without an echo of their own may lie as near
         beside = BESIDE_BORDER_MM / square
-        here, there = _label_on(ray, solids, y - beside), _label_on(ray, solids, y + beside)
+        here, there = _label_on(rested, solids, y - beside - depth), _label_on(rested, solids, y + beside - depth)
         if here == there:
             return
     lines, depths = paths.labels.shape
@@ -312,7 +330,9 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
     r = reflection(impedance[here], impedance[there], speed[here], speed[there], square)
     whole = 1.0
     if solids.layers[0] < solids.layers[1] and abs(r) < BONE:
-        whole = patch_at(solids.grown.strands, *resting_place(solids, ray.x + ray.dx * y, ray.y + ray.dy * y, ray.z + ray.dz * y))
+        miss = y - depth
+        x0, y0, z0 = rested.x + rested.dx * miss, rested.y + rested.dy * miss, rested.z + rested.dz * miss
+        whole = patch_at(solids.grown.strands, x0, y0, z0)
     mirror = np.exp(-0.5 * (2 * scanner.wavenumber * tissues.roughness[solid + 1] * square) ** 2)
     line_mm = scanner.line_mm * widening(y, scanner.bend)
     area, carrier = line_mm / SUBLINES * ACROSS_MM, _turned(2 * scanner.wavenumber * seen)
@@ -327,8 +347,7 @@ def _lay_facet(field, ray, pose, crossing, solids, tissues, scanner, beam, paths
             value *= _unaliased(2 * order * scanner.wavenumber * slope_x * line_mm)
             value *= _unaliased(2 * order * scanner.wavenumber * slope_z * ACROSS_MM)
             if order == 1 and mirror < 1:
-                at = resting_place(solids, ray.x + ray.dx * depth, ray.y + ray.dy * depth, ray.z + ray.dz * depth)
-                phase = _phase_of_patch(at[0], at[1], at[2], scanner.seed)
+                phase = _phase_of_patch(rested.x, rested.y, rested.z, scanner.seed)
                 value += _scatter(mirror, impedance[here], impedance[there], square, area, scanner) * _turned(phase)
             if value != 0:
                 echo = np.complex64(whole * strength * value) * beam.elevation[row, int(abs(ray.across) / STEP_MM + 0.5)]

@@ -129,7 +129,7 @@ def test_the_skin_lies_in_the_foot_or_below_it(pressed):
     skin = np.column_stack([places[:, :2], np.full(len(places), TOP)])
     gap = moved_to(pressed, skin)[:, 2] - places[:, 2]  # below the foot
     touched = np.abs(places[:, 1]) < 4.5
-    assert np.abs(gap[touched]).max() < 0.1
+    assert np.abs(gap[touched]).max() < 0.12  # between nodes of the skin
     assert gap.min() > -0.15
 
 

@@ -180,7 +180,7 @@ def test_light_shows_marks_where_the_skin_has_carried_them(rig):
         reshape_things(world, there)
         places = []
         for device in cameras:
-            image = render(world, CameraOptics.of(device), ProjectorOptics.of(rig.projector), light, Tracing(samples=16), 3)[0]
+            image = render(world, CameraOptics.of(device), ProjectorOptics.of(rig.projector), light, Tracing(samples=64), 3)[0]
             places.append(
                 [_dark_spot(image, device.optics.camera().project(there.things[0].mesh.vertices[[mark]])[0]) for mark in marks]
             )

@@ -7,6 +7,7 @@ from scipy.ndimage import map_coordinates
 
 from recon.geometry import rigid
 from scenes.tissue import Tissue
+from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import OVERSAMPLING, STEP_MM, Beam
 from twin.ultrasound.echo_field import BESIDE_MM, field_like
 from twin.ultrasound.echo_solids import Body, Solid, Wire
@@ -236,10 +237,27 @@ def wire_echoes(wire: Wire, around: Tissue, transducer: Transducer, spread: Beam
     return field
 
 
-def focused(field: np.ndarray, spread: Beam) -> np.ndarray:
+def focused(field: np.ndarray, axial: np.ndarray, lateral: np.ndarray, reach: np.ndarray) -> np.ndarray:
     """Field after the pulse, row by row, and after the beam, line by line."""
-    rows, reach, half = len(spread.axial), spread.axial.shape[1] // 2, spread.lateral.shape[1] // 2
-    padded = np.pad(field.astype(complex), ((0, 0), (reach, reach)))
-    pulsed = np.array([padded[:, OVERSAMPLING * r : OVERSAMPLING * r + 2 * reach + 1] @ spread.axial[r] for r in range(rows)])
-    near = np.abs(np.arange(-half, half + 1)) <= spread.reach[:, None]
-    return np.array([np.correlate(pulsed[r], np.conj(spread.lateral[r] * near[r]), "valid") for r in range(rows)])
+    taps, half = axial.shape[1] // 2, lateral.shape[1] // 2
+    padded = np.pad(field.astype(complex), ((0, 0), (taps, taps)))
+    pulsed = [padded[:, OVERSAMPLING * r : OVERSAMPLING * r + 2 * taps + 1] @ axial[r] for r in range(len(axial))]
+    near = np.abs(np.arange(-half, half + 1)) <= reach[:, None]
+    return np.array([np.correlate(one, np.conj(beam), "valid") for one, beam in zip(pulsed, lateral * near, strict=True)])
+
+
+def envelope(field: np.ndarray, transducer: Transducer, spread: Beam, focus: np.ndarray) -> np.ndarray:
+    """Envelope of several looks, without noise, ringing and clutter, of a focus : (rows, lines)."""
+    wide, picture, power = bmode_image.blunt(transducer), transducer.picture, 0.0
+    evened = np.sqrt(spread.lateral_energy / wide.lateral_energy)[:, None]
+    alike = [
+        np.vdot(b, a).real / np.linalg.norm(a) / np.linalg.norm(b) for a, b in zip(spread.lateral, wide.lateral, strict=True)
+    ]
+    both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * np.array(alike)[:, None])
+    for band, angle in product(range(picture.bands), range(picture.angles)):
+        axial = bmode_image.part_of_band(spread, transducer, band)
+        sharp, blurred = (
+            focused(field, axial, bmode_image.steered(beam.lateral, transducer, angle), beam.reach) for beam in (spread, wide)
+        )
+        power = power + np.abs((np.sqrt(focus) * sharp + np.sqrt(1 - focus) * evened * blurred) / both) ** 2
+    return bmode_image.gain_over_depth(transducer, spread)[:, None] * np.sqrt(power / picture.bands / picture.angles)

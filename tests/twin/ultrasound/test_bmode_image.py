@@ -7,18 +7,36 @@ from tests.twin.ultrasound import plain_sound
 from twin.ultrasound import bmode_image
 from twin.ultrasound.beam import beam
 from twin.ultrasound.echo_field import field_like
+from twin.ultrasound.scanner_picture import Picture
+from twin.ultrasound.sound_paths import Paths
 
 
 @pytest.fixture
-def echoes(small, rng):
-    """A field of random echoes in a narrow image."""
-    array = small.model_copy(update={"image_size": (32, 200)})
-    parts = rng.standard_normal((*field_like(array, beam(array)).shape, 2), dtype=np.float32)
-    return beam(array), parts.view(np.complex64)[..., 0]
+def narrow(small):
+    """An array of a narrow image."""
+    return small.model_copy(update={"image_size": (32, 200)})
+
+
+@pytest.fixture
+def echoes(narrow, rng):
+    """A field of random echoes."""
+    parts = rng.standard_normal((*field_like(narrow, beam(narrow)).shape, 2), dtype=np.float32)
+    return beam(narrow), parts.view(np.complex64)[..., 0]
 
 
 def test_pulse_and_beam_are_those_of_the_slow_way(echoes):
     """Both are sums along one axis: 600 terms in float32 leave 1e-5."""
     spread, field = echoes
-    slow = plain_sound.focused(field, spread)
+    slow = plain_sound.focused(field, spread.axial, spread.lateral, spread.reach)
     assert np.abs(bmode_image.focused(field, spread) - slow).max() < 1e-5 * np.abs(slow).max()
+
+
+def test_looks_are_those_of_the_slow_way(narrow, echoes, rng):
+    """As above, of three directions in two parts of the band, with a focus and edges that change from place to place."""
+    spread, field = echoes
+    silent = {"aperture_rays": 3, "noise_db": -300, "face_ring_mm": 0, "picture": Picture(bands=2, angles=3)}
+    array, lines = narrow.model_copy(update=silent), np.zeros((32, 250), np.float32)
+    focus, edges = rng.uniform(0, 1, (2, *lines.shape)).astype(np.float32)
+    paths = Paths(array.scale_mm_per_px[1], lines.astype(np.uint8), lines, lines, lines, focus, edges)
+    slow = edges[:, :200].T * plain_sound.envelope(field, array, spread, focus[:, :200].T)
+    assert np.abs(bmode_image.envelope(field, array, spread, paths, rng) - slow).max() < 1e-5 * slow.max()

@@ -12,6 +12,7 @@ from twin.ultrasound.grown_layers import (
     layer_at,
     layer_distance,
     layer_normal,
+    layer_slope,
     packed,
     patch_at,
     strand_at,
@@ -60,7 +61,7 @@ def test_the_last_layer_that_holds_a_point_counts_within_the_first(layers, point
         d = plain(layer, points)
         expected[np.abs(d) <= layer.half_mm if layer.half_mm else d <= 0] = k
     expected[plain(layers.layers[0], points) > 0] = NONE
-    found = [layer_at(grown.sure, *grid, *point) for point in points]
+    found = [layer_at(grown.sure, grown.among, *grid, *point) for point in points]
     assert (found == expected).all() and set(expected) == {NONE, 0, 1, 2, 3}
     assert 0.1 < (grown.sure == -2).mean() < 0.95  # both ways of looking were tried
 
@@ -71,6 +72,15 @@ def test_distances_are_those_of_faces(layers, points):
         d = plain(layer, points)
         expected = np.where(d == FAR_MM, FAR_MM - layer.half_mm, np.abs(d) - layer.half_mm) if layer.half_mm else d
         np.testing.assert_allclose([layer_distance(*grid, k, *point) for point in points], expected, atol=1e-4)
+
+
+def test_slopes_are_those_of_the_cell(layers):
+    """Differences over 0.01 mm: distances in float32 leave 1e-5 of them."""
+    _, (distance, _, *place) = grid_of(layers)
+    for share in np.random.default_rng(5).uniform(0.1, 0.9, (50, 3)):
+        point = FIRST + STEP_MM * (share + 4)
+        across = np.array([np.diff(plain(layers.layers[2], point + np.outer([-0.005, 0.005], axis)))[0] for axis in np.eye(3)])
+        np.testing.assert_allclose(layer_slope(distance, *place, 2, *point), across / np.linalg.norm(across), atol=1e-4)
 
 
 def test_normals_point_outwards_from_both_faces_of_a_sheet():
