@@ -41,23 +41,27 @@ TISSUES = {
     "wood": Tissue(1.9, 3300.0, 8.0, -4.0, 0.03),  # assumed, across the grain: it absorbs all
     "nylon": Tissue(2.9, 2600.0, 1.0, None, 0.01),  # wires and fishing line [K]
     "skin": Tissue(
-        1.72, 1555.0, 1.84, 10.0, 0.03, True, strands_db=2.0, modulus_kpa=60.0
-    ),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; bright, assumed
-    "fat": Tissue(1.31, 1440.0, 0.73, 0.0, 0.04, True),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
+        1.72, 1555.0, 1.84, 6.0, 0.03, True, strands_db=4.0, modulus_kpa=60.0
+    ),  # 1109 kg/m3, 1555 m/s [L]; attenuation [I]; echoes assumed, as bright as gland, in plies
+    "fat": Tissue(
+        1.31, 1440.0, 0.73, 0.0, 0.015, True
+    ),  # 911 kg/m3, 1440 m/s [L]; attenuation at 7 MHz [F]; reference of BI-RADS
     "ligament": Tissue(
-        1.66, 1457.0, 1.26, 6.0, 0.02, True, 10.0, modulus_kpa=60.0
-    ),  # 1142 kg/m3, 1457 m/s, attenuation [L]; echoes assumed
+        1.66, 1457.0, 2.5, 5.0, 0.015, True, 15.0, modulus_kpa=60.0
+    ),  # 1142 kg/m3, 1457 m/s [L]; they shadow: twice the attenuation of [L], for what they bend aside; echoes assumed
     "gland": Tissue(
-        1.60, 1540.0, 0.75, 10.0, 0.02, True, strands_db=4.5, modulus_kpa=3.24
-    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 10 times the echo of fat [A]
+        1.60, 1540.0, 0.75, 8.5, 0.015, True, strands_db=2.5, modulus_kpa=3.24
+    ),  # 1041 kg/m3, 1540 m/s, attenuation [L]; 7 times the echo of fat, which is 10 [A] less some that scanners' medians ask for
     "duct": Tissue(1.56, 1520.0, 0.3, -4.0, 0.01, True, modulus_kpa=3.24),  # fluid and walls, assumed
     "nipple": Tissue(1.72, 1555.0, 3.0, 2.0, 0.02, True, modulus_kpa=15.0),  # dense connective tissue that shadows, assumed
     "muscle": Tissue(
-        1.73, 1588.0, 0.62, 4.0, 0.02, True, 6.0, 5.5, modulus_kpa=10.0
-    ),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed
+        1.73, 1588.0, 0.62, 2.0, 0.02, True, 3.0, 2.5, modulus_kpa=10.0
+    ),  # 1090 kg/m3, 1588 m/s, attenuation [I]; echoes assumed, dark between bright septa
     "fascia": Tissue(1.83, 1664.0, 1.2, 8.0, 0.02, True, 12.0, modulus_kpa=60.0),  # as ligaments and tendons [I]; echoes assumed
-    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.05),  # 1908 kg/m3, 3515 m/s, attenuation [I]
-    "lung": Tissue(0.37, 949.0, 20.0, None, 0.05),  # 394 kg/m3, 949 m/s [I]: it lets nothing back
+    "bone": Tissue(6.7, 3515.0, 4.74, 0.0, 0.006),  # 1908 kg/m3, 3515 m/s, attenuation [I]
+    "lung": Tissue(
+        0.37, 949.0, 1.0, 8.0, 0.008
+    ),  # 394 kg/m3, 949 m/s [I]; what alveoli throw to and fro trails behind its face, assumed
 }
 
 KINDS = "scenes.kinds"  # of scenes, a module each

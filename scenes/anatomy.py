@@ -2,7 +2,8 @@
 
 From the skin inwards: skin; subcutaneous fat in lobules, which Cooper's ligaments part; the gland's cone behind the nipple, with
 islands of fat and ducts; fat behind it; the pectoral muscle under its fascia; ribs; the lung. Lobules are the cells of a warped
-Voronoi diagram, as in Bakic et al. 2003 and Pokrajac et al. 2012, and ligaments their borders.
+Voronoi diagram, as in Bakic et al. 2003 and Pokrajac et al. 2012, and ligaments their borders. The gland is made of such cells,
+so that fat scallops it; it is mottled, fat differs from lobule to lobule, and septa run along a muscle's bundles.
 
 Phantom frame: chest in z = 0, z up to the apex; see `scenes.dome`.
 """
@@ -44,7 +45,7 @@ class Anatomy(Part):
     """standard deviation of the skin's thickness over some 12 mm, of it; assumed"""
     areola_skin_mm: Annotated[float, Field(ge=0, le=5)] = 0.8
     """by which the skin is thicker at the areola; assumed"""
-    septum_mm: Annotated[float, Field(ge=1.5, le=40)] = 4.0
+    septum_mm: Annotated[float, Field(ge=1.5, le=40)] = 6.0
     """from septum to septum along the skin, many of them broken; assumed"""
     lobule_mm: Annotated[float, Field(ge=4, le=40)] = 18.0
     """width of fat lobules, which are 0.45 of it thick: patients lie on their backs; assumed"""
@@ -56,12 +57,14 @@ class Anatomy(Part):
     """fat between gland and muscle; assumed"""
     ducts: Annotated[int, Field(ge=0, le=40)] = 12
     """main ducts; 9 on average [Ramsay et al. 2005], more by others"""
+    bundle_mm: Annotated[float, Field(ge=1, le=10)] = 2.2
+    """from septum to septum in the muscle; assumed by the look of published images"""
     muscle_mm: Positive = 9.0
     """thickness of the pectoral muscle; assumed"""
     rib_mm: Positive = 32.0
     """from rib to rib; assumed"""
     uneven_db: Annotated[float, Field(ge=0, le=10)] = 2.2
-    """standard deviation of the backscatter within a tissue, over 2 to 8 mm, and twice that within gland and muscle; assumed"""
+    """standard deviation of the backscatter within a tissue, over 2 to 12 mm, and twice that within gland and muscle; assumed"""
     voxel_mm: Annotated[float, Field(ge=0.7, le=2)] = 1.0
     """of the grid"""
 
@@ -109,17 +112,18 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
     from_nipple = np.hypot(x - nipple[0], y - nipple[1])
     skin_mm = anatomy.skin_mm * (1 + anatomy.skin_uneven * noise.plane(12).clip(-2, 2)) + 0.1 * noise(4)
     skin_mm = skin_mm + anatomy.areola_skin_mm * np.exp(-((from_nipple / 14) ** 2))
-    muscle = (z - 4 - 1.5 * noise.plane(60)).astype(np.float32)  # height over the muscle
+    muscle = (z - 7 - 1.0 * noise.plane(60)).astype(np.float32)  # height over the muscle
     chest_mm = 3 + 0.0002 * (x**2 + y**2)  # by which the chest falls away to the sides
     muscle = np.maximum(muscle + chest_mm, skin_mm + 2 - depth).astype(np.float32)
 
-    gland = _gland(anatomy, grid, noise, depth, muscle, from_nipple)
     strata = _strata(depth, muscle, noise)
-    sheets = _ligaments(anatomy, grid, noise, strata)
+    lobules = _lobules(anatomy, grid, noise, strata)
+    gland, glandular = _gland(anatomy, grid, noise, lobules, strata, depth, muscle, from_nipple)
+    cooper = _ligaments(anatomy, grid, noise, lobules, glandular, gland, strata)
     layers = [
         Layer("fat", _cut(skin_mm - depth), mirrors=True),
-        *(Layer(f"ligament{k}", sheet, half_mm=anatomy.ligament_mm / 2) for k, sheet in enumerate(sheets)),
         Layer("gland", gland),
+        Layer("ligament0", cooper, half_mm=anatomy.ligament_mm / 2),
     ]
     if anatomy.ducts:
         layers.append(Layer("duct", _ducts(anatomy, grid, gland, nipple, rng)))
@@ -127,16 +131,13 @@ def grow(anatomy: Anatomy, skin: Dome, rng: np.random.Generator) -> GrownBreast:
     layers += [
         Layer("nipple", _cut(core - 5.5)),
         Layer("muscle", muscle),  # of which the fibres' direction is that of the whole field
+        Layer("ligament1", _septa(anatomy, grid, noise, strata, muscle), half_mm=anatomy.ligament_mm / 2),
         Layer("fascia", _cut(muscle), half_mm=0.3),
-        Layer("rib", _ribs(anatomy, grid, muscle), mirrors=True),
-        Layer("lung", _cut(muscle + anatomy.muscle_mm + 11), mirrors=True),
+        Layer("rib", _ribs(anatomy, grid, muscle + 0.3 * noise(8)), mirrors=True),
+        Layer("lung", _cut(muscle + anatomy.muscle_mm + 11 + 0.5 * noise(9)), mirrors=True),
     ]
-    coarse, strands = noise(7), _along(strata, grid, noise((9, 9, 1.5)))  # of fat, and of gland and muscle: bundles along strata
-    streaky = (muscle < 0) | (gland < 0)
-    spread_db = anatomy.uneven_db * np.where(streaky, 2.0, 1.0)
-    uneven = spread_db * np.where(streaky, (2 * strands + coarse) / np.sqrt(5), (strands + coarse) / np.sqrt(2))
-    uneven -= np.log(10) / 20 * spread_db**2  # so that the mean power is the tissue's
-    return GrownBreast(grid, tuple(layers), uneven.astype(np.float32), strata, depth)
+    uneven = _unevenness(anatomy, grid, noise, lobules, strata, gland, muscle)
+    return GrownBreast(grid, tuple(layers), uneven, strata, depth)
 
 
 def in_world(layer: Volume, grid: Grid, world_from_phantom: Array) -> tuple[Volume, Array]:
@@ -230,18 +231,69 @@ def redistance(field: Volume, step: float) -> Volume:
     return np.where(np.abs(far) <= step, np.clip(near, -1.5 * step, 1.5 * step), far).clip(-REACH_MM, REACH_MM).astype(np.float32)
 
 
-def _gland(anatomy: Anatomy, grid: Grid, noise: _Noise, depth: Volume, muscle: Volume, from_nipple: Array) -> Volume:
-    """Distance to the gland: a cone from the nipple to the muscle with a ragged border, and islands of fat in it."""
+class _Lobules(NamedTuple):
+    """Cells of a warped Voronoi diagram that fill the grid, flat along the strata."""
+
+    nearest: NDArray[np.int64]  # (n, 5) cells by the distance of their seeds
+    distance: Array  # (n, 5) to these, over a cell's width
+    count: int
+    grid: Grid
+    width_mm: float
+
+    def means(self, field: Array) -> Array:
+        """Means of a field over each cell : (count,)."""
+        cell = self.nearest[:, 0]
+        total = np.bincount(cell, np.broadcast_to(field, self.grid.shape).ravel(), self.count)
+        return total / np.maximum(np.bincount(cell, minlength=self.count), 1)
+
+    def border(self, inside: NDArray[np.bool_]) -> Array:
+        """Distance, mm, about, to the faces that part cells of one kind, (count,), from the others; negative within."""
+        of = inside[self.nearest]
+        to_these, to_others = (np.where(kind, self.distance, np.inf).min(axis=1) for kind in (of, ~of))
+        gap = np.clip((to_these - to_others) / 2, -0.5, 0.5).reshape(self.grid.shape)
+        slope = np.linalg.norm(np.gradient(gap, self.grid.step), axis=0)
+        return gap / np.maximum(slope, 0.5 / self.width_mm)
+
+
+def _lobules(anatomy: Anatomy, grid: Grid, noise: _Noise, strata: Volume) -> _Lobules:
+    """Lobules of fat and of gland alike: the gland's border is scalloped by the fat that lies on it."""
+    size = anatomy.lobule_mm * np.array([1, 1, 0.45])
+    wide = anatomy.lobule_mm
+    lengths = ((wide, wide, 0.35 * wide), (wide, wide, 0.35 * wide), (wide, wide, wide))  # mm; sides slant and overlap
+    warp = [0.22 * wide * noise(length) for length in lengths]
+    places = (*grid.axes()[:2], strata)
+    scaled = np.stack([(axis + bent) / mm for axis, bent, mm in zip(places, warp, size, strict=True)], axis=-1)
+    low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
+    cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
+    seeds = cells.reshape(-1, 3) + 0.5 + noise.rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
+    distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
+    return _Lobules(np.asarray(nearest), np.asarray(distance), len(seeds), grid, wide)
+
+
+def _gland(
+    anatomy: Anatomy,
+    grid: Grid,
+    noise: _Noise,
+    lobules: _Lobules,
+    strata: Volume,
+    depth: Volume,
+    muscle: Volume,
+    from_nipple: Array,
+) -> tuple[Volume, NDArray[np.bool_]]:
+    """Distance to the gland, and the lobules it is made of: a cone from the nipple to the muscle, and islands of fat in it."""
     covered = anatomy.subcutaneous_mm * (1 + 0.35 * noise.plane(30)) * (1 - np.exp(-((from_nipple / 16) ** 2)))
     wide = 0.36 * (grid.shape[0] + grid.shape[1]) / 2 * grid.step
     within = np.minimum(depth - anatomy.skin_mm - covered, muscle - anatomy.retromammary_mm)
     within = np.minimum(within, (wide + 9 * noise.plane(35) - from_nipple) / 2)
-    ragged = within + 2.5 * noise(14) + 1.5 * noise(5)
+    ragged = within + 2.0 * noise(14)
     breast = (depth > anatomy.skin_mm) & (muscle > 0)
+    mean = lobules.means(np.where(breast, ragged, -9.0))
     share = GLANDULAR[anatomy.density]
-    level = max(float(np.quantile(ragged[breast], 1 - 1.25 * share)), 0.0)
-    fat = noise(9) + 0.4 * noise(4) - 0.9  # positive in islands
-    return np.maximum(redistance(level - ragged, grid.step), redistance(fat, grid.step))
+    glandular = mean >= np.quantile(mean[lobules.nearest[:, 0].reshape(grid.shape)[breast]], 1 - 1.35 * share)
+    fringe = 1.8 * _along(strata, grid, noise((9, 9, 2.5))) + 0.4 * noise(3)  # mm, by which its border frays, most along strata
+    outer = np.maximum(lobules.border(glandular) + fringe, np.maximum(anatomy.skin_mm + 0.7 - depth, 1 - muscle))
+    fat = noise((8, 8, 5)) + 0.4 * noise(4) - 1.3  # positive in islands
+    return np.maximum(_cut(gaussian_filter(outer, 0.8)), redistance(fat, grid.step)), glandular
 
 
 def _strata(depth: Volume, muscle: Volume, noise: _Noise) -> Volume:
@@ -249,7 +301,7 @@ def _strata(depth: Volume, muscle: Volume, noise: _Noise) -> Volume:
     way_mm = 45.0  # from skin to muscle, where it is its true length
     above, below = np.maximum(muscle, 0), np.maximum(-muscle, 0)
     level = way_mm * depth / np.maximum(depth + above, way_mm / 2) + below
-    wavy = 1.3 * noise((18, 18, 9)) + 0.35 * noise((5, 5, 4))
+    wavy = 1.3 * noise((18, 18, 9)) + 0.15 * noise((6, 6, 4))
     return (gaussian_filter(level, 1.0) + wavy).astype(np.float32)
 
 
@@ -260,35 +312,58 @@ def _along(strata: Volume, grid: Grid, field: Volume) -> Volume:
     return laid / laid.std()
 
 
-def _ligaments(anatomy: Anatomy, grid: Grid, noise: _Noise, strata: Volume) -> list[Volume]:
-    """Distances to two sets of sheets, of sign: Cooper's ligaments, and septa that lie along the strata.
+def _ligaments(
+    anatomy: Anatomy, grid: Grid, noise: _Noise, lobules: _Lobules, glandular: NDArray[np.bool_], gland: Volume, strata: Volume
+) -> Volume:
+    """Distance to Cooper's ligaments, of sign: borders between lobules that fall to different sides of a toss, and the gland's.
 
-    Ligaments are borders of Voronoi cells that fall to different sides of one of two tosses, which part three quarters of
-    neighbours, so that some lobules hang together. Septa are wavy, and taper to nothing here and there. Distances are stretched
-    or shrunk as sheets are thinner or thicker.
+    So some lobules hang together. Distances are stretched or shrunk as sheets are thinner or thicker; within the gland they fade.
     """
-    lobule = anatomy.lobule_mm * np.array([1, 1, 0.45])
-    warp = [0.22 * anatomy.lobule_mm * noise(anatomy.lobule_mm) + 0.5 * noise(4) for _ in range(3)]
-    places = (*grid.axes()[:2], strata)
-    scaled = np.stack([(axis + bent) / size for axis, bent, size in zip(places, warp, lobule, strict=True)], axis=-1)
-    low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
-    cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
-    seeds = cells.reshape(-1, 3) + 0.5 + noise.rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
-    distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
-    cooper: Array = np.full(grid.shape, np.inf)
-    for _ in range(2):
-        side = noise.rng.random(len(seeds)) < 0.5
-        heads = side[nearest]
-        to_heads, to_tails = (np.where(kind, distance, np.inf).min(axis=1) for kind in (heads, ~heads))
-        gap = np.clip((to_tails - to_heads) / 2, -0.5, 0.5).reshape(grid.shape)
-        slope = np.linalg.norm(np.gradient(gap, grid.step), axis=0)
-        cooper = _either(cooper, gap / np.maximum(slope, 0.5 / anatomy.lobule_mm))
-    thin = np.exp(0.7 * (_along(strata, grid, noise((12, 12, 5))) + 0.5 * noise(4) - 0.6)).clip(0.25, 8)
+    tossed = lobules.border(noise.rng.random(lobules.count) < 0.5)
+    cooper = _either(tossed, lobules.border(glandular))
+    thin = np.exp(1.0 * (_along(strata, grid, noise((10, 10, 5))) + 0.5 * noise(5) - 0.3)).clip(0.4, 8)
+    return _cut(cooper * thin * np.where(gland < -1, 2.0, 1.0))
+
+
+def _septa(anatomy: Anatomy, grid: Grid, noise: _Noise, strata: Volume, muscle: Volume) -> Volume:
+    """Distance to septa, of sign: along strata in fat and gland, tapering off; in muscle between bundles, along its fibres.
+
+    Bundles lie askew to the muscle's face by some degrees, and are thick and thin, as their septa are.
+    """
     spacing = anatomy.septum_mm / np.pi
-    level = strata + 2.0 * noise((16, 16, 8)) + 0.6 * noise((5, 5, 5))
-    septum = spacing * np.sin(level / spacing)
-    faint = np.exp(1.2 * (_along(strata, grid, noise((11, 11, 4))) + 0.5 * noise(4)) + 0.3).clip(0.3, 12)
-    return [_cut(cooper * thin), _cut(septum * faint)]
+    level = strata + 2.0 * noise((16, 16, 8)) + 0.3 * noise((6, 6, 6))
+    faint = np.exp(1.2 * (_along(strata, grid, noise((11, 11, 4))) + 0.3 * noise(5)) + 0.6).clip(0.45, 12)
+    septum = spacing * np.sin(level / spacing) * faint
+    x, y, _ = grid.axes()
+    bundle = anatomy.bundle_mm / np.pi
+    depth = -muscle + 0.06 * (x + y) + 1.0 * noise((25, 25, 6)) + 0.5 * noise((14, 14, 3))
+    fading = np.exp(1.5 * _along(depth.astype(np.float32), grid, noise((16, 16, 2.5))) + 0.3 * noise(4)).clip(0.3, 12)
+    return _cut(np.where(muscle < 0, bundle * np.sin(depth / bundle) * fading, septum))
+
+
+def _unevenness(
+    anatomy: Anatomy, grid: Grid, noise: _Noise, lobules: _Lobules, strata: Volume, gland: Volume, muscle: Volume
+) -> Volume:
+    """Backscatter over its tissue's, dB : of each tissue's mean power.
+
+    Fat differs from lobule to lobule, and little within one. Gland is mottled: its lobules and ducts are dark in bright stroma,
+    some mm wide and half as thick. Muscle has bundles along its fibres.
+    """
+    toss = noise.rng.standard_normal(lobules.count)[lobules.nearest[:, 0]].reshape(grid.shape)
+    fat = 0.75 * gaussian_filter(toss, 0.7) + 0.65 * noise(9)
+    dark = 1 / (1 + np.exp(-4 * (_along(strata, grid, noise((5, 5, 2.5))) - 0.4)))  # in a third of it
+    mottled = 0.75 * (0.33 - dark) / 0.4 + 0.5 * _along(strata, grid, noise((10, 10, 4))) + 0.45 * noise(12)
+    bundles = 0.8 * _along(strata, grid, noise((14, 14, 2.5))) + 0.6 * noise(9)
+    found = np.zeros(grid.shape, np.float32)
+    for tissue, field, spread in (
+        ((gland >= 0) & (muscle >= 0), fat, 1.0),
+        ((gland < 0) & (muscle >= 0), mottled, 2.0),
+        (muscle < 0, bundles, 2.0),
+    ):
+        if tissue.any():
+            levels = anatomy.uneven_db * spread * field[tissue] / field[tissue].std()
+            found[tissue] = levels - 10 * np.log10(np.mean(10 ** (levels / 10)))
+    return found
 
 
 def _either(one: Array, other: Array) -> Array:
@@ -322,10 +397,10 @@ def _ducts(anatomy: Anatomy, grid: Grid, gland: Volume, nipple: Array, rng: np.r
 
 
 def _ribs(anatomy: Anatomy, grid: Grid, muscle: Volume) -> Volume:
-    """Distance, at most the true one, to ribs across the chest, oval, slightly bent."""
+    """Distance, at most the true one, to ribs aslant across the chest, oval, slightly bent; slope assumed."""
     x, y, _ = grid.axes()
     wide, thick = 6.5, 4.0  # half of a rib's width and thickness
-    across = y - 0.12 * x - 0.0006 * x**2
+    across = (y - 0.5 * x - 0.0006 * x**2) / np.hypot(1, 0.5)
     beside = (across + anatomy.rib_mm / 2) % anatomy.rib_mm - anatomy.rib_mm / 2
     below = muscle + anatomy.muscle_mm + thick
     return _cut((np.hypot(beside / wide, below / thick) - 1) * thick)
