@@ -160,6 +160,12 @@ def carried_back(moved, back, first, per_mm, x, y, z):
     return rx, ry, rz
 
 
+@njit(inline="always")
+def _spans(first, per_mm, count, x):
+    """1 within a grid along an axis, 0 beside it, where the field goes on as at its end."""
+    return 1.0 if 0 <= (x - first) * per_mm <= count - 1 else 0.0
+
+
 @kernel
 def cofactors(moved, first, per_mm, x, y, z):
     """Sides of a unit cube that rested at a place, as vectors of their areas, row by row, and its volume.
@@ -168,9 +174,12 @@ def cofactors(moved, first, per_mm, x, y, z):
     """
     cell = nearest_cell(first, per_mm, moved.shape, x, y, z)
     a, b, c = slope_within(moved, cell, 0), slope_within(moved, cell, 1), slope_within(moved, cell, 2)
-    p0, p1, p2 = 1 + per_mm * a[0], per_mm * b[0], per_mm * c[0]  # what 1 mm along x has become
-    q0, q1, q2 = per_mm * a[1], 1 + per_mm * b[1], per_mm * c[1]
-    r0, r1, r2 = per_mm * a[2], per_mm * b[2], 1 + per_mm * c[2]
+    x_per_mm = per_mm * _spans(first[0], per_mm, moved.shape[0], x)
+    y_per_mm = per_mm * _spans(first[1], per_mm, moved.shape[1], y)
+    z_per_mm = per_mm * _spans(first[2], per_mm, moved.shape[2], z)
+    p0, p1, p2 = 1 + x_per_mm * a[0], x_per_mm * b[0], x_per_mm * c[0]  # what 1 mm along x has become
+    q0, q1, q2 = y_per_mm * a[1], 1 + y_per_mm * b[1], y_per_mm * c[1]
+    r0, r1, r2 = z_per_mm * a[2], z_per_mm * b[2], 1 + z_per_mm * c[2]
     across_x = q1 * r2 - q2 * r1, q2 * r0 - q0 * r2, q0 * r1 - q1 * r0
     across_y = r1 * p2 - r2 * p1, r2 * p0 - r0 * p2, r0 * p1 - r1 * p0
     across_z = p1 * q2 - p2 * q1, p2 * q0 - p0 * q2, p0 * q1 - p1 * q0

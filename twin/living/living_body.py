@@ -157,7 +157,7 @@ class LivingSweep:
     patient: LivingBody
     transducer: Transducer
     path: Track  # world_from_image over all of the sweep
-    met: dict[int, Met] = dataclass_field(init=False, default_factory=dict)  # by the moment, ns, of images that were taken
+    met: dict[tuple[int, bytes], Met] = dataclass_field(init=False, default_factory=dict)  # by moment and pose of images taken
 
     def body_from_image(self, times: Moments, world_from_image: Array) -> Array:
         """Poses : (n, 4, 4) of images in the body's frame, in which it rests."""
@@ -179,7 +179,7 @@ class LivingSweep:
     def under_image(self, time: int, body_from_image: Array) -> Displacement:
         """`field` when an image is taken, of which the truth is kept, so that no field is worked out twice."""
         found = self.field(time, body_from_image)
-        self.met[time] = self._met(found, body_from_image)
+        self.met[time, body_from_image.tobytes()] = self._met(found, body_from_image)
         return found
 
     def scene_at(self, scene: Scene, time: int) -> Scene:
@@ -201,7 +201,7 @@ class LivingSweep:
         """
         poses, motion = self.body_from_image(times, world_from_image), self.patient.world_from_body(times)
         moments = zip(times.tolist(), poses, strict=True)
-        met = [self.met.get(time) or self._met(self.field(time, pose), pose) for time, pose in moments]
+        met = [self.met.get((time, pose.tobytes())) or self._met(self.field(time, pose), pose) for time, pose in moments]
         centres = [rigid.apply(carried, one.centres) for carried, one in zip(motion, met, strict=True)]
         return {
             "world_from_body": motion,

@@ -4,14 +4,15 @@ An echo from a place reaches each element of the aperture on a way of its own. R
 directions that the aperture of a place takes in; for each place, over those that start on the array,
 
     amplitude = sqrt(A_t A_r) (B_t B_r)^(1/4),   A = sum(w a) / sum_all(w),   B = sum(w a^2) / sum_all(w),
-    delay = sum(w D) / sum(w),   focus = exp(-2 k^2 var(D - tilt)),
+    delay = sum(v D) / sum(v),   focus = exp(-2 k^2 var(D - tilt)),   v = (w_t + w_r) a,
 
 with the weights w of the aperture that sends and of that which receives, a ray's amplitude a one way, and its delay D over that
-of a medium of the assumed speed, both ways. A is the field in the beam's middle, and B over A² how much wider the beam of a
-partly shaded aperture is: their product is the power of speckle, for which, too, what a disturbed wave front loses in its focus
-it sends beside it. A delay that rises along the aperture shifts the beam, as refraction does; what is left spoils the focus
-(Strehl's ratio, by Marechal's approximation). What shades and bends stands halfway between face and place, by assumption, where
-it matters whether it meets all of a line's beam alike, as it does close to the face, or each place by itself.
+of a medium of the assumed speed, both ways. A is the field in the beam's middle. A partly shaded aperture's beam is wider, by
+about B/A², so that the power of speckle is (A_t A_r)² times the mean of both; echoes of even faces take the same. What a
+disturbed wave front loses in its focus it sends beside it. A delay that rises along the apertures shifts the beam, as refraction
+does; what is left spoils the focus (Strehl's ratio, by Marechal's approximation). What shades and bends stands halfway between
+face and place, by assumption, where it matters whether it meets all of a line's beam alike, as it does close to the face, or
+each place by itself.
 Source: Born & Wolf, Principles of Optics, 9.1; Nock, Trahey & Smith 1989 for phase aberration by tissue.
 """
 
@@ -31,7 +32,7 @@ Array = NDArray[np.float64]
 
 NOTHING = -50.0  # nepers, of a ray that begins in air
 ECHO_MM = 3.0  # of depth that the echo of a slanted border takes within a beam; assumed
-FAINT = 1e-4  # amplitude of rays, one way, whose delays don't count
+FAINT = 1e-4  # amplitude of rays, one way, whose delays count as little as those of fainter ones
 STRIDE = 4  # levels from one average to the next: between them, it hardly changes
 
 
@@ -45,7 +46,7 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
         return paths
     count, levels = paths.labels.shape
     depths = paths.step_mm * np.arange(levels)
-    tangents = np.linspace(-1, 1, rays + 2)[1:-1] / (2 * transducer.receive_f_number)
+    tangents = np.linspace(-1, 1, rays + 2)[1:-1] / (2 * min(transducer.receive_f_number, transducer.transmit_f_number))
     places = lines.pitch_mm * np.arange(count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), places)
     along = np.zeros((2, rays, count, levels), np.float32)  # loss and delay down each ray
@@ -79,7 +80,8 @@ def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam) -> NDAr
     share, taps = np.abs(spread.lateral) ** 2, np.arange(spread.lateral.shape[1]) - spread.lateral.shape[1] // 2
     sigma = np.sqrt((share * taps**2).sum(axis=1) / share.sum(axis=1))  # lines; of a box, its half width over the root of 3
     level, above = np.minimum(np.arange(amplitude.shape[1]), len(share) - 1), round(ECHO_MM / step_mm / 2)
-    power, least = maximum_filter1d(amplitude.astype(float) ** 2, 2 * above + 1, axis=1, origin=above), 1e-9
+    power = maximum_filter1d(amplitude.astype(float) ** 2, 2 * above + 1, axis=1, origin=above)
+    least = 1e-4 * power.max(axis=0) + 1e-30
     mean = _mean(power, np.rint(np.sqrt(3) * sigma[level]).astype(int))
     return (((power + least) / (mean + least)).clip(0, 4) ** 0.25).astype(np.float32)
 
@@ -96,7 +98,7 @@ def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
     bent = _mean(paths.shift_mm, half) / 2
     # Lines never cross, or one would gather the power of three
     seen, shown = np.sort(along[:, None] + bent, axis=0), np.sort(along[:, None] - bent, axis=0)
-    shift = _mean(along[:, None] - np.stack([np.interp(along, *one) for one in zip(seen.T, shown.T, strict=True)], axis=1), half)
+    shift = _mean(np.stack([np.interp(along, one, one - line) for one, line in zip(seen.T, shown.T, strict=True)], axis=1), half)
     thinned = np.clip(1 - np.gradient(shift, pitch_mm, axis=0), 0.05, 4.0)
     amplitude, focus = paths.amplitude * np.sqrt(thinned), _mean(paths.focus, half)
     return paths._replace(
@@ -176,7 +178,7 @@ def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refrac
                 d = between(along[1, ray, at, level], along[1, ray, at + 1, level], share)
                 sent, sent2 = sent + sending * one_way, sent2 + sending * one_way * one_way
                 heard, heard2 = heard + hearing * one_way, heard2 + hearing * one_way * one_way
-                weight = (sending + hearing) * one_way if one_way > FAINT else 0.0
+                weight = (sending + hearing) * max(one_way, FAINT)
                 x = start - line
                 there, delay, sdd = there + weight, delay + weight * d, sdd + weight * d * d
                 sx, sxx, sxd = sx + weight * x, sxx + weight * x * x, sxd + weight * x * d

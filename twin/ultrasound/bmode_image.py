@@ -49,16 +49,25 @@ def _shares_of_focus(transducer: Transducer, beam: Beam, paths: Paths) -> NDArra
     if transducer.aperture_rays == 1:
         return np.ones((1, len(beam.lateral), len(paths.focus)), np.float32)
     wide = blunt(transducer)
-    row = np.minimum(np.arange(len(beam.lateral)), paths.focus.shape[1] - 1)
-    focus = paths.focus[:, row].T
+    focus, edges = _as_shown(paths, transducer)
     inner, energies = (beam.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(beam.lateral) ** 2).sum(axis=1)
     alike = inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1))  # of the same scatterers
     both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike.astype(np.float32)[:, None])
     evened = np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
-    return np.stack([np.sqrt(focus), evened * np.sqrt(1 - focus)]) / both * paths.edges[:, row].T
+    return np.stack([np.sqrt(focus), evened * np.sqrt(1 - focus)]) / both * edges
 
 
-@lru_cache(maxsize=16)
+def _as_shown(paths: Paths, transducer: Transducer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Focus and edges : (rows, lines) of the places that are shown there: of other depths, and aside."""
+    rows, lines = transducer.rows_mm, np.arange(len(paths.focus))
+    deep = np.maximum.accumulate(paths.shown_mm, axis=1)  # behind what slows sound down it may seem to turn back
+    levels = np.rint([np.interp(rows, one, np.arange(len(one))) for one in deep]).astype(int)  # (lines, rows)
+    aside = np.rint(paths.shift_mm[lines[:, None], levels] / lines_of(transducer).pitch_mm).astype(int)
+    place = np.clip(lines[:, None] + aside, 0, len(lines) - 1)
+    return paths.focus[place, levels].T, paths.edges[place, levels].T
+
+
+@lru_cache(maxsize=9)  # as many as the most directions
 def _spectra(transducer: Transducer, angle: int) -> Field:
     """Spectra along the array of the sharp point spread of a look, and of the blunt one of several rays : (1 | 2, rows, n)."""
     beams = [beam_of(transducer)] if transducer.aperture_rays == 1 else [beam_of(transducer), blunt(transducer)]
@@ -105,7 +114,7 @@ def _clutter(power: NDArray[np.float32], transducer: Transducer, rng: np.random.
     weights = gaussian(2 * reach + 1, picture.clutter_mm / sx).astype(np.float32)
     padded = np.pad(power, [(0, 0), (reach, reach)], mode="edge")
     decay, smeared = np.exp(-sy / trail_mm), fftconvolve(padded, weights[None] / weights.sum(), mode="valid", axes=1)
-    smeared = np.asarray(lfilter([1 - decay], [1, -decay], smeared, axis=0))
+    smeared = np.asarray(lfilter([1 - decay], [1, -decay], np.maximum(smeared, 0), axis=0))  # Fourier's rounding may be below 0
     grain = rng.exponential(size=(len(power) // 2 + 1, power.shape[1] // 4 + 1)).astype(np.float32)
     grain = cv2.resize(grain, power.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0)
     return (10 ** (picture.clutter_db / 10) * smeared * grain).astype(np.float32)

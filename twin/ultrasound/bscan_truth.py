@@ -98,5 +98,8 @@ def _fill_labels(first, end, shown, paths, rows_mm, line_mm):
         for row in range(len(rows_mm)):
             while level < depths - 1 and (paths.shown_mm[line, level] + paths.shown_mm[line, level + 1]) / 2 < rows_mm[row]:
                 level += 1
-            aside = int(np.rint(np.float32(line) + paths.shift_mm[line, level] / line_mm[row]))
-            shown[row, line] = paths.labels[min(max(aside, 0), lines - 1), level]
+            place = line  # that is shown on this line: shifts are those of places
+            for _ in range(3):
+                aside = int(np.rint(np.float32(line) + paths.shift_mm[place, level] / line_mm[row]))
+                place = min(max(aside, 0), lines - 1)
+            shown[row, line] = paths.labels[place, level]

@@ -102,7 +102,8 @@ def low_frequencies(absorbed, spread):
 
     Loss rises with the frequency, and the spectrum is a Gaussian of the variance `spread` over its squared frequency.
     """
-    return absorbed * min(spread * absorbed, LOWEST) / 2
+    sunk = min(spread * absorbed, LOWEST)
+    return sunk * absorbed - sunk * sunk / (2 * spread) if spread > 0 else 0.0
 
 
 @njit(inline="always")

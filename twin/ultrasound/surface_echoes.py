@@ -291,11 +291,12 @@ def _at_rest(ray, t, solids):
 def _facet(ray, rested, y, solids, solid, pose):
     """Depth of a solid's border on a ray, cosine to its normal, and slopes along the array and across the plane."""
     nx, ny, nz = resting_normal(solids, solid, rested.x, rested.y, rested.z)
+    onwards = nx * rested.dx + ny * rested.dy + nz * rested.dz
     nx, ny, nz = turned(solids, nx, ny, nz, rested.x, rested.y, rested.z)
     cosine = nx * ray.dx + ny * ray.dy + nz * ray.dz
     square = max(abs(cosine), 1e-6)
     miss = resting_distance(solids, solid, rested.x, rested.y, rested.z)
-    depth = y - miss / cosine if abs(miss) < 0.1 and abs(cosine) > GLANCING else y
+    depth = y - miss / onwards if abs(miss) < 0.1 and abs(cosine) > GLANCING else y
     slope_x = (nx * pose[0, 0] + ny * pose[1, 0] + nz * pose[2, 0]) / square
     slope_z = (nx * pose[0, 2] + ny * pose[1, 2] + nz * pose[2, 2]) / square
     return depth, square, slope_x, slope_z

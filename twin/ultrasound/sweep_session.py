@@ -21,7 +21,7 @@ from scenes.handheld.shaft import Shaft
 from scenes.scene_types import Scene
 from twin import conditions
 from twin.session import Session, TruthFolder, describe
-from twin.ultrasound import bscan_truth, scan_lines, screen, tool_truth
+from twin.ultrasound import bscan_truth, scan_lines, tool_truth
 from twin.ultrasound.bscan import Scan
 from twin.ultrasound.echo_solids import Body, Solid, label_at
 from twin.ultrasound.probe_path import (
@@ -163,11 +163,9 @@ def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm:
 
 
 def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:
-    """The rig's true probe calibration, right where sound travels as the scanner assumes; of pixels of what the scanner sends."""
-    scale, (u, v, _, _) = np.array(rig.probe.scale_mm_per_px), screen.part_of(transducer)
-    image_from_sent = rigid.transform(np.eye(3), (-scale[0] * u, -scale[1] * v, 0.0))
-    target_from_sent = rig.probe.target_from_image.matrix() @ image_from_sent
-    return ProbeCalibration(target_from_sent, scale, speed_m_s=transducer.assumed_speed, face_row=float(v))
+    """The rig's true probe calibration, right where sound travels as the scanner assumes."""
+    scale = np.array(rig.probe.scale_mm_per_px)
+    return ProbeCalibration(rig.probe.target_from_image.matrix(), scale, speed_m_s=transducer.assumed_speed)
 
 
 class FilmPart(Protocol):
@@ -254,11 +252,11 @@ def write_session(
                         shown[further].append(tool_truth.placed(shaft, transducer, one.paths, pose))
                 labels = bscan_truth.labels(one.paths, transducer)
                 write_images([truth.own / LABELS / image_name(number)], labels[None])
-                yield SCANNER, screen.on_screen(one.image, transducer, int(planned.times[number]))
+                yield SCANNER, one.image
             if film is not None:
                 yield from film.images()
 
-        times, devices = {SCANNER: planned.times}, {SCANNER: Device(size=screen.sent_size(transducer))}
+        times, devices = {SCANNER: planned.times}, {SCANNER: Device(size=transducer.image_size)}
         if film is not None:
             times |= dict.fromkeys(film.devices, film.times)
             devices |= film.devices

@@ -56,8 +56,6 @@ class Transducer(Part):
     dynamic_range_db: Annotated[float, Field(ge=10, le=120)] = 60.0
     bits: Annotated[int, Field(ge=1, le=8)] = 8
     picture: Picture = Picture()
-    screen: tuple[Annotated[int, Field(ge=16, le=8192)], Annotated[int, Field(ge=16, le=8192)]] | None = None
-    """width, height, px, of the scanner's screen, sent as a whole, with the B-scan in its middle; null sends the B-scan alone"""
 
     @model_validator(mode="before")
     @classmethod
@@ -89,17 +87,13 @@ class Transducer(Part):
         return self
 
     @model_validator(mode="after")
-    def _fits_its_screen(self) -> "Transducer":
-        beside, above = 120, 90  # px, for greys and ruler, and for texts
-        least = self.image_size[0] + beside, self.image_size[1] + above
-        if self.screen is not None and (self.screen[0] < least[0] or self.screen[1] < least[1]):
-            raise ValueError(f"screen: expected {least[0]}x{least[1]} px or more around the image, found {list(self.screen)}")
-        return self
-
-    @model_validator(mode="after")
     def _looks(self) -> "Transducer":
         if self.aperture_rays % 2 == 0:
             raise ValueError(f"aperture_rays: expected an odd number, with one ray in the middle, found {self.aperture_rays}")
+        foci = (self.transmit_focus_mm, *self.focal_zones_mm)
+        if len(set(foci)) < len(foci) or max(foci[1:], default=0.0) > self.depth_mm:
+            expected = f"foci that differ, no deeper than {self.depth_mm:.4g} mm"
+            raise ValueError(f"focal_zones_mm: expected {expected}, found {list(foci[1:])} beside {foci[0]:g}")
         for name, several in (("aperture_rays", self.aperture_rays > 1), ("picture.angles", self.picture.angles > 1)):
             if several and self.face is not None:
                 raise ValueError(f"{name}: expected 1 for an array that isn't linear, found more")

@@ -100,8 +100,11 @@ def shown_labels(paths: Paths, transducer: Transducer) -> np.ndarray:
     for line in range(lines):
         between = (paths.shown_mm[line, :-1] + paths.shown_mm[line, 1:]) / 2
         level = np.clip(np.searchsorted(between, transducer.rows_mm), 0, depths - 1)
-        aside = np.rint(line + paths.shift_mm[line, level] / transducer.scale_mm_per_px[0]).astype(int)
-        shown[:, line] = paths.labels[np.clip(aside, 0, lines - 1), level]
+        place = np.full(len(level), line)
+        for _ in range(3):  # the fixed point `place = line + shift(place)`
+            aside = np.rint(line + paths.shift_mm[place, level] / transducer.scale_mm_per_px[0]).astype(int)
+            place = np.clip(aside, 0, lines - 1)
+        shown[:, line] = paths.labels[place, level]
     return shown
 
 

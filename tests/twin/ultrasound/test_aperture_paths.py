@@ -10,7 +10,8 @@ from scenes import solid_meshes
 from scenes.scene_types import Material, Thing
 from scenes.tissue import Tissue
 from tests.twin.ultrasound.phantoms import down
-from twin.ultrasound.aperture_paths import over_aperture
+from twin.ultrasound.aperture_paths import _edges, _evened, over_aperture
+from twin.ultrasound.beam import beam, receive_aperture, sent_aperture
 from twin.ultrasound.echo_solids import Body, solid
 from twin.ultrasound.sound_paths import follow
 from twin.ultrasound.transducer import Transducer
@@ -97,6 +98,38 @@ def test_a_shadow_widens_and_fills_with_depth():
     edges = [np.flatnonzero(found.amplitude[40:280, level] < 0.95) for level in levels]
     widths = [0.1229 * np.ptp(edge) for edge in edges]
     assert widths[0] < 6 < widths[1] < widths[2]
+
+
+def test_the_sending_aperture_is_whole_at_its_focus_and_one_zone_beside_it():
+    """Fresnel's zones: half as deep as the focus F, the path at half the width s is longer by s²/2 (2/F - 1/F)."""
+    focus, width = ARRAY.transmit_focus_mm, ARRAY.transmit_focus_mm / ARRAY.transmit_f_number
+    whole, half = sent_aperture(ARRAY, np.array([focus, focus / 2]))
+    assert whole == width
+    longer = (half / 4) ** 2 / 2 / focus
+    assert half == width or longer == pytest.approx(ARRAY.wavelength_mm / 4)
+    assert (sent_aperture(ARRAY, np.array([2.0])) < receive_aperture(ARRAY, np.array([20.0]))).all()
+
+
+def test_a_constant_shift_stays_to_both_ends():
+    """By the same amplitude: lines neither crowd nor part."""
+    found = paths()
+    for shift in (1.0, -1.0):
+        moved = _evened(found._replace(shift_mm=np.full_like(found.shift_mm, shift)), np.full(found.labels.shape[1], 6.0), 0.1229)
+        np.testing.assert_allclose(moved.shift_mm, shift, atol=1e-5)
+        np.testing.assert_allclose(moved.amplitude, found.amplitude, rtol=1e-5)
+
+
+def test_edges_of_a_shadow_are_kept_where_the_beam_blurs_them():
+    """The beam's mean power across a step, with the factor twice, is nearer to the step; even tissue, weak or not, has none."""
+    spread = beam(ARRAY)
+    step = np.where(np.arange(321)[:, None] < 160, 1.0, 0.01) * np.ones((1, 408), np.float32)
+    factor = _edges(step.astype(np.float32), ARRAY.scale_mm_per_px[1], spread)[:, 300]
+    share = np.abs(spread.lateral[300]) ** 2 / (np.abs(spread.lateral[300]) ** 2).sum()
+    blurred = np.sqrt(np.convolve(np.pad(step[:, 300] ** 2, 32, mode="edge"), share, mode="valid"))
+    off = [np.abs(kept - step[:, 300])[140:180].sum() for kept in (blurred, blurred * factor, blurred * factor**2)]
+    assert off[0] > 1.5 * off[1] > 1.5 * off[2]
+    for level in (1.0, 1e-4):
+        np.testing.assert_allclose(_edges(np.full((321, 408), level, np.float32), 0.1225, spread), 1, atol=1e-4)
 
 
 def test_a_ragged_layer_spoils_the_focus():

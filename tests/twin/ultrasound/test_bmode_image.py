@@ -35,8 +35,18 @@ def test_looks_are_those_of_the_slow_way(narrow, echoes, rng):
     """As above, of three directions in two parts of the band, with a focus and edges that change from place to place."""
     spread, field = echoes
     silent = {"aperture_rays": 3, "noise_db": -300, "face_ring_mm": 0, "picture": Picture(bands=2, angles=3)}
-    array, lines = narrow.model_copy(update=silent), np.zeros((32, 250), np.float32)
-    focus, edges = rng.uniform(0, 1, (2, *lines.shape)).astype(np.float32)
-    paths = Paths(array.scale_mm_per_px[1], lines.astype(np.uint8), lines, lines, lines, focus, edges)
+    array, still = narrow.model_copy(update=silent), np.zeros((32, 250), np.float32)
+    focus, edges = rng.uniform(0, 1, (2, *still.shape)).astype(np.float32)
+    deep = still + np.float32(array.scale_mm_per_px[1]) * np.arange(250, dtype=np.float32)
+    paths = Paths(array.scale_mm_per_px[1], still.astype(np.uint8), deep, still, still, focus, edges)
     slow = edges[:, :200].T * plain_sound.envelope(field, array, spread, focus[:, :200].T)
     assert np.abs(bmode_image.envelope(field, array, spread, paths, rng) - slow).max() < 1e-5 * slow.max()
+
+
+def test_clutter_about_a_mirror_darkens_nothing(clean, rng):
+    """An echo 70 dB over faint noise: the sum of powers is one everywhere, whatever Fourier's rounding is."""
+    array = clean.model_copy(update={"noise_db": -72.0, "picture": Picture(clutter_db=-32.0)})
+    field = field_like(array, beam(array))
+    field[100:130, 160:166] = 3e3
+    paths = Paths(0.1225, np.zeros((321, 490), np.uint8), *(np.ones((321, 490), np.float32) for _ in range(5)))
+    assert np.isfinite(bmode_image.envelope(field, array, beam(array), paths, rng)).all()

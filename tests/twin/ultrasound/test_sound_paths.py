@@ -11,7 +11,7 @@ from tests.twin.ultrasound import plain_sound
 from tests.twin.ultrasound.phantoms import down
 from twin.ultrasound.aperture_paths import over_aperture
 from twin.ultrasound.echo_solids import body
-from twin.ultrasound.sound_paths import follow, reflection
+from twin.ultrasound.sound_paths import LOWEST, follow, low_frequencies, reflection
 
 
 def test_reflection_at_normal_incidence():
@@ -64,3 +64,19 @@ def test_lines_beyond_the_gel_have_air_before_them(clean):
     cut = over_aperture(follow(there, several, pose), there, several, pose).amplitude[:, 200]
     assert cut[half + 100] < 1e-12
     assert 0.5**1.5 < cut[half - 2] / cut[half - 100] < 0.6  # half of the aperture is left, and the ray in its middle
+
+
+@pytest.mark.parametrize("absorbed", [0.5, 4.0, 12.0])
+def test_low_frequencies_last_longer_as_a_gaussian_spectrum_says(absorbed):
+    """The spectrum times its loss at each frequency, as long as its middle sinks by less than a half; then held there."""
+    spread = 0.06
+    sunk = min(spread * absorbed, LOWEST)
+    gained = low_frequencies(absorbed, spread)
+    assert gained == pytest.approx(sunk * absorbed - sunk**2 / (2 * spread))
+    if sunk < LOWEST:
+        share = np.linspace(-3, 3, 20001)  # of the frequency, beside the middle
+        whole = np.trapezoid(np.exp(-(share**2) / (2 * spread) - absorbed * (1 + share)), share)
+        assert np.log(whole / np.trapezoid(np.exp(-(share**2) / (2 * spread)), share)) + absorbed == pytest.approx(
+            gained, rel=1e-3
+        )
+    assert low_frequencies(absorbed, 0.0) == 0
