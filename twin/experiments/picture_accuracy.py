@@ -25,22 +25,24 @@ PLACES = ((-12.0, -10.0), (28.0, -20.0), (26.0, 20.0), (-30.0, 20.0), (0.0, -40.
 STILL = Hand(shift_mm=0, turn_deg=0)
 
 
-def recorded() -> dict:
-    """Figures of the recorded images."""
+def recorded() -> dict[str, dict]:
+    """Figures of the recorded images, by the recordings' name."""
     return json.loads(RECORDED.read_text(encoding="utf-8"))
 
 
-def realism(setup: Setup, scanner: str, seeds: Sequence[int]) -> Figures:
+def realism(setup: Setup, scanner: str, seeds: Sequence[int], beside: Sequence[str]) -> Figures:
     """Medians of rendered pictures over those of recorded ones, off from 1 in %, and the divergence of the greys, bits."""
     array = setup.scanners[scanner]
     pictures = [figures for seed in seeds for figures in views(array, seed)]
-    theirs = recorded()
-    found: Figures = {"images": len(pictures), "recordings": theirs["images"]}
-    for name, row in theirs["figures"].items():
-        ours = float(np.nanmedian([getattr(picture, name) for picture in pictures]))
-        found |= {f"{name}_ours": ours, f"{name}_percent": 100 * abs(ours / row["median"] - 1)}
+    medians = {name: float(np.nanmedian([getattr(one, name) for one in pictures])) for name in PictureFigures._fields[:-1]}
     histogram = np.mean([picture.histogram for picture in pictures], axis=0)
-    return found | {"divergence_bits": divergence(histogram, np.array(theirs["histogram"]))}
+    found: Figures = {"images": len(pictures)} | {f"{name}_ours": value for name, value in medians.items()}
+    for name in beside:
+        theirs = recorded()[name]
+        found |= {f"{name}_images": theirs["images"]}
+        found |= {f"{name}_{of}_percent": 100 * abs(medians[of] / row["median"] - 1) for of, row in theirs["figures"].items()}
+        found |= {f"{name}_divergence_bits": divergence(histogram, np.array(theirs["histogram"]))}
+    return found
 
 
 def views(array: Transducer, seed: int) -> list[PictureFigures]:
