@@ -82,8 +82,9 @@ def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam) -> NDAr
     level, above = np.minimum(np.arange(amplitude.shape[1]), len(share) - 1), round(ECHO_MM / step_mm / 2)
     power = maximum_filter1d(amplitude.astype(float) ** 2, 2 * above + 1, axis=1, origin=above)
     least = 1e-4 * power.max(axis=0) + 1e-30
-    mean = _mean(power, np.rint(np.sqrt(3) * sigma[level]).astype(int))
-    return (((power + least) / (mean + least)).clip(0, 4) ** 0.25).astype(np.float32)
+    half = np.rint(np.sqrt(3) * sigma[level]).astype(int)
+    nepers = np.log((power + least) / (_mean(power, half) + least)) / 4
+    return np.exp(_mean(_mean(nepers, half // 2), half // 2)).astype(np.float32)  # smooth, or each line would show its own
 
 
 def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
