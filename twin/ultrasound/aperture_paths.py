@@ -151,6 +151,15 @@ def _hann(share):
     return np.cos(np.pi / 2 * share) ** 2 if share < 1 else 0.0
 
 
+@njit(inline="always")
+def _line_of_delays(weight, d, dd, x, xx, xd):
+    """Delay where x is 0, its slope, and the variance left, of a line through delays d at x, from weighted sums."""
+    mean, middle = d / weight, x / weight
+    variance, covariance = xx / weight - middle * middle, xd / weight - middle * mean
+    slope = covariance / variance if variance > 1e-6 else 0.0
+    return mean - slope * middle, slope, max(dd / weight - mean * mean - slope * covariance, 0.0)
+
+
 @kernel(fastmath=True)
 def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refract):
     """Average over the rays that meet each place of some lines."""
@@ -183,14 +192,9 @@ def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refrac
                 x = start - line
                 there, delay, sdd = there + weight, delay + weight * d, sdd + weight * d * d
                 sx, sxx, sxd = sx + weight * x, sxx + weight * x * x, sxd + weight * x * d
-            if there == 0:
-                there = 1.0
             both = every_sent * every_heard
-            mean, x0 = delay / there, sx / there
-            spread, cross = sxx / there - x0 * x0, sxd / there - x0 * mean
-            tilt = cross / spread if spread > 1e-6 else 0.0  # mm a line of the face
-            left = max(sdd / there - mean * mean - tilt * cross, 0.0)
-            out.shown_mm[line, level] = step * level + mean - tilt * x0
+            late, tilt, left = _line_of_delays(max(there, 1e-30), delay, sdd, sx, sxx, sxd)
+            out.shown_mm[line, level] = step * level + late
             out.amplitude[line, level] = np.sqrt(sent * heard / both) * (sent2 * heard2 / both) ** 0.25
             out.shift_mm[line, level] = tilt / pitch_mm * step * level if refract else 0.0
             out.focus[line, level] = np.exp(-2 * (wavenumber * wavenumber) * left)
