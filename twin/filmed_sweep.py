@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 MOST_PRESSED_MM = 15.0  # by which the face may get into a solid that yields
+SKIN_MM = 1.0  # the same of grown tissue that keeps its form: within its skin
 Shown = Callable[[Iterable["Frames"], int], Iterable["Frames"]]
 
 
@@ -230,7 +231,8 @@ def plan_sweep(settings: SweepSettings) -> PlannedSweep:
     living = None
     if settings.living.lives:
         living = living_body(settings.living, scanned, getattr(settings.path, "surface", ""), settings.own_seed)
-    most_mm = MOST_PRESSED_MM if settings.living.yields else sweep_session.GIVES_MM
+    rigid_mm = sweep_session.GIVES_MM if scanned.grown is None else SKIN_MM
+    most_mm = MOST_PRESSED_MM if settings.living.yields else rigid_mm
     plan = sweep_session.plan_sweep(
         settings.path,
         settings.rig,

@@ -138,7 +138,7 @@ def test_wires_cross_where_the_protocol_has_them(tmp_path):
         (["scene=tank", "path=bob", "path.seconds=0.04"], "path: expected one that lasts two images, found 0.040 s"),
         (
             ["scene=cylinders", "path.surface=inner", "path.start_mm=[0,-2]", "path.end_mm=[2,-2]"],
-            "path: expected the probe in front of all things, found it in outer after 0.00 s",
+            "path: expected the probe no more than 5 mm deep in a thing, found it in outer after 0.00 s",
         ),
         (
             ["path=wires"],

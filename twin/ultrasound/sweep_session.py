@@ -159,7 +159,9 @@ def refuse_inside(course: Track, body: Body, transducer: Transducer, allowed_mm:
         found = max(label_at(tables, *point) for point in rigid.apply(pose, face))
         if found:
             name = body.solids[found - 1].name
-            raise InputError(f"path: expected the probe in front of all things, found it in {name} after {time * 1e-9:.2f} s")
+            way = "; living=patient lets it yield" if body.grown is not None else ""
+            expected = "in front of all things" if allowed_mm == 0 else f"no more than {allowed_mm:g} mm deep in a thing"
+            raise InputError(f"path: expected the probe {expected}, found it in {name} after {time * 1e-9:.2f} s{way}")
 
 
 def calibration_of(rig: Rig, transducer: Transducer) -> ProbeCalibration:

@@ -326,5 +326,5 @@ def test_hard_things_do_not_yield():
 
 
 def test_a_probe_that_stays_is_not_breathed_into(rig):
-    with pytest.raises(InputError, match="expected the probe in front of all things"):
+    with pytest.raises(InputError, match="expected the probe no more than 5 mm deep in a thing"):
         plan_sweep(settings(rig, living=Living(breathing_mm=40.0, breathing_s=1.0, follows=0.0)))
