@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.compiled import kernel, njit
 from recon.threads import in_threads
-from twin.trilinear import nearest_cell, slope_within
+from twin.trilinear import Cell, nearest_cell, slope_within
 
 Array = NDArray[np.float64]
 Field = NDArray[np.float32]
@@ -235,15 +235,10 @@ def _steepest(first, end, slopes, moved):
     for i in range(first, end):
         for j in range(moved.shape[1] - 1):
             for k in range(moved.shape[2] - 1):
-                slope = 0.0
+                middle, slope = Cell(i, j, k, 0.5, 0.5, 0.5), 0.0
                 for n in range(3):
-                    p, q = moved[i, j, k, n], moved[i, j, k + 1, n]
-                    r, s = moved[i, j + 1, k, n], moved[i, j + 1, k + 1, n]
-                    t, u = moved[i + 1, j, k, n], moved[i + 1, j, k + 1, n]
-                    v, w = moved[i + 1, j + 1, k, n], moved[i + 1, j + 1, k + 1, n]
-                    slope += ((t + u + v + w - p - q - r - s) / 4) ** 2
-                    slope += ((r + s + v + w - p - q - t - u) / 4) ** 2
-                    slope += ((q + s + u + w - p - r - t - v) / 4) ** 2
+                    a, b, c = slope_within(moved, middle, n)
+                    slope += a * a + b * b + c * c
                 slopes[i] = max(slopes[i], slope)
 
 

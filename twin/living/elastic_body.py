@@ -230,10 +230,11 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
         pushed = np.einsum("i,minj,j->mn", normal, skin, normal)
         pushed += 1e-6 * np.trace(pushed) / len(pushed) * np.eye(len(pushed))
         root = np.linalg.cholesky(pushed)
-    flow = spread(soft, base)
-    for again in (True, False):  # large displacements leave some of the depth
+
+    def pushed(depth: Array) -> tuple[Array, Flow]:
+        """Forces of the points that push the skin by a depth : (m,), and what flows by them."""
         with soft.lock, soft.blas.limit(limits=1):
-            force, _ = nnls(root.T, np.linalg.solve(root, wanted))
+            force, _ = nnls(root.T, np.linalg.solve(root, depth))
             forces = force[:, None] * normal
             if drag is not None and force.any():
                 forces += _dragging(skin, forces, force > 0, normal, drag)
@@ -241,10 +242,11 @@ def press(soft: ElasticBody, face: Array, normal: Array, already: Array | None =
             for node, push in zip(nodes.tolist(), share.T @ forces, strict=True):
                 if push.any():
                     moved += push.astype(np.float32) @ responses[node]
-        flow = spread(soft, moved.reshape(base.shape))
-        if again:
-            wanted = wanted + np.where(force > 0, (face - led_to(flow, rested)) @ normal, 0)
-    return led_through(flow)
+        return force, spread(soft, moved.reshape(base.shape))
+
+    force, flow = pushed(wanted)
+    left = np.where(force > 0, (face - led_to(flow, rested)) @ normal, 0)  # as displacements are large
+    return led_through(pushed(wanted + left)[1])
 
 
 class _Under(NamedTuple):
