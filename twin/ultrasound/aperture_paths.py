@@ -46,21 +46,37 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
         return paths
     count, levels = paths.labels.shape
     depths = paths.step_mm * np.arange(levels)
-    tangents = np.linspace(-1, 1, rays + 2)[1:-1] / (2 * min(transducer.receive_f_number, transducer.transmit_f_number))
     places = lines.pitch_mm * np.arange(count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), places)
     along = np.zeros((2, rays, count, levels), np.float32)  # loss and delay down each ray
-    tissues = body.acoustics(transducer.frequency_mhz)
+    tissues, tangents = body.acoustics(transducer.frequency_mhz), _tangents(transducer)
     delays = paths.step_mm * (transducer.assumed_speed / tissues.speed - 1)
     spread = transducer.spectral_variance(depths)
     in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, spread, poses, tangents, lines.pitch_mm)
     along[0, :, without_contact(paths, transducer)] = NOTHING
+    labels = np.ascontiguousarray(paths.labels[:, ::STRIDE])
+    means = Paths(STRIDE * paths.step_mm, labels, *(np.empty(labels.shape, np.float32) for _ in range(5)))
+    weights = _weights(transducer, depths[::STRIDE])
+    in_threads(_gather, count, means, along, tangents, weights, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
+    means = means._replace(edges=_edges(means.amplitude, means.step_mm, beam(transducer), paths.step_mm))
+    if transducer.refraction:
+        means = _evened(means, means.step_mm * np.arange(labels.shape[1]) * (tangents[1] - tangents[0]), lines.pitch_mm)
+    out = Paths(paths.step_mm, paths.labels, *(np.empty(paths.labels.shape, np.float32) for _ in range(5)))
+    in_threads(_fill, count, out, means)
+    return out
+
+
+def _tangents(transducer: Transducer) -> Array:
+    """Slopes of the rays against the line, down to the places that they meet."""
+    widest = 1 / (2 * min(transducer.receive_f_number, transducer.transmit_f_number))
+    return widest * np.linspace(-1, 1, transducer.aperture_rays + 2)[1:-1]
+
+
+def _weights(transducer: Transducer, depths: Array) -> Array:
+    """Hann's weights : (2, rays, levels) of the rays in the apertures that send and receive."""
     half = np.stack([sent_aperture(transducer, depths), receive_aperture(transducer, depths)]) / 2
-    out = Paths(paths.step_mm, paths.labels, *(np.empty((count, levels), np.float32) for _ in range(5)))
-    in_threads(_gather, count, out, along, tangents, half, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
-    apart = depths * (tangents[1] - tangents[0]) / lines.pitch_mm
-    out = out._replace(edges=_edges(out.amplitude, out.step_mm, beam(transducer)))
-    return _evened(out, apart, lines.pitch_mm) if transducer.refraction else out
+    aside = np.abs(_tangents(transducer))[:, None] * depths
+    return np.cos(np.pi / 2 * np.minimum(aside / half[:, None], 1)) ** 2
 
 
 def _mean(table: Array, half: NDArray[np.int64]) -> Array:
@@ -72,17 +88,18 @@ def _mean(table: Array, half: NDArray[np.int64]) -> Array:
     return (sums[end, level] - sums[first, level]) / (end - first)
 
 
-def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam) -> NDArray[np.float32]:
+def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam, row_mm: float) -> NDArray[np.float32]:
     """Factor after the beam that gives shadows back half of what it blurs of their edges: losses are those of places.
 
     What shades starts to count ECHO_MM farther down, as it would cut its own border's echo in two.
     """
-    share, taps = np.abs(spread.lateral) ** 2, np.arange(spread.lateral.shape[1]) - spread.lateral.shape[1] // 2
+    rows = np.rint(step_mm * np.arange(amplitude.shape[1]) / row_mm).astype(int)
+    lateral, above = spread.lateral[np.minimum(rows, len(spread.lateral) - 1)], round(ECHO_MM / step_mm / 2)
+    share, taps = np.abs(lateral) ** 2, np.arange(lateral.shape[1]) - lateral.shape[1] // 2
     sigma = np.sqrt((share * taps**2).sum(axis=1) / share.sum(axis=1))  # lines; of a box, its half width over the root of 3
-    level, above = np.minimum(np.arange(amplitude.shape[1]), len(share) - 1), round(ECHO_MM / step_mm / 2)
     power = maximum_filter1d(amplitude.astype(float) ** 2, 2 * above + 1, axis=1, origin=above)
     least = 1e-4 * power.max(axis=0) + 1e-30
-    half = np.rint(np.sqrt(3) * sigma[level]).astype(int)
+    half = np.rint(np.sqrt(3) * sigma).astype(int)
     nepers = np.log((power + least) / (_mean(power, half) + least)) / 4
     return np.exp(_mean(_mean(nepers, half // 2), half // 2)).astype(np.float32)  # smooth, or each line would show its own
 
@@ -90,12 +107,12 @@ def _edges(amplitude: NDArray[np.float32], step_mm: float, spread: Beam) -> NDAr
 def _evened(paths: Paths, apart: Array, pitch_mm: float) -> Paths:
     """Paths whose shifts and foci are means over the gaps between rays, and whose amplitudes keep the power of bent beams.
 
-    Rays stand so many lines `apart` : (levels,), so that their tilts change from line to line by more than a whole aperture's.
+    Rays stand `apart` : (levels,) mm, so that their tilts change from line to line by more than a whole aperture's.
     Shifts are those midway between a line and the place it sees. Where they crowd places on a line it holds more scatterers,
     but no beam carries more power for being bent.
     """
     count = len(paths.labels)
-    half, along = np.minimum(np.rint(apart / 2).astype(int), count // 2), pitch_mm * np.arange(count)
+    half, along = np.minimum(np.rint(apart / pitch_mm / 2).astype(int), count // 2), pitch_mm * np.arange(count)
     bent = _mean(paths.shift_mm, half) / 2
     # Lines never cross, or one would gather the power of three
     seen, shown = np.sort(along[:, None] + bent, axis=0), np.sort(along[:, None] - bent, axis=0)
@@ -146,12 +163,6 @@ def _passed(solids, tissues, pose, depth, tangent, here, there):
 
 
 @njit(inline="always")
-def _hann(share):
-    """Weight of a place in shares of half an aperture."""
-    return np.cos(np.pi / 2 * share) ** 2 if share < 1 else 0.0
-
-
-@njit(inline="always")
 def _line_of_delays(weight, d, dd, x, xx, xd):
     """Delay where x is 0, its slope, and the variance left, of a line through delays d at x, from weighted sums."""
     mean, middle = d / weight, x / weight
@@ -161,45 +172,49 @@ def _line_of_delays(weight, d, dd, x, xx, xd):
 
 
 @kernel(fastmath=True)
-def _gather(first, end, out, along, tangents, half, pitch_mm, wavenumber, refract):
-    """Average over the rays that meet each place of some lines."""
-    _, rays, count, levels = along.shape
-    step = out.step_mm
+def _gather(first, end, means, along, tangents, weights, pitch_mm, wavenumber, refract):
+    """Average over the rays that meet each place of some lines, at every STRIDE-th level."""
+    _, rays, count, _ = along.shape
     for line in range(first, end):
-        out.shown_mm[line, 0], out.amplitude[line, 0], out.shift_mm[line, 0], out.focus[line, 0] = 0, 1, 0, 1
-        reach = 0.0  # lines from the start of a ray of tangent 1 to the place below it
-        before = 0
-        for level in range(1, levels):
-            reach += step / pitch_mm
-            if level % STRIDE != 0 and level != levels - 1:
-                continue
+        means.shown_mm[line, 0], means.amplitude[line, 0], means.shift_mm[line, 0], means.focus[line, 0] = 0, 1, 0, 1
+        for mark in range(1, means.labels.shape[1]):
+            level, depth = STRIDE * mark, means.step_mm * mark
             every_sent = every_heard = sent = heard = sent2 = heard2 = 0.0
             there = delay = sx = sxx = sxd = sdd = 0.0
             for ray in range(rays):
-                start = line - tangents[ray] * reach
-                aside = abs(start - line) * pitch_mm
-                sending, hearing = _hann(aside / half[0, level]), _hann(aside / half[1, level])
+                x = -tangents[ray] * depth / pitch_mm  # lines from the place to the start of its ray
+                sending, hearing = weights[0, ray, mark], weights[1, ray, mark]
                 every_sent, every_heard = every_sent + sending, every_heard + hearing
-                if start < 0 or start > count - 1 or sending + hearing == 0:
+                if line + x < 0 or line + x > count - 1 or sending + hearing == 0:
                     continue
-                at = min(int(start), count - 2)
-                share = start - at
+                at = min(int(line + x), count - 2)
+                share = line + x - at
                 one_way = np.exp(between(along[0, ray, at, level], along[0, ray, at + 1, level], share) / 2)
                 d = between(along[1, ray, at, level], along[1, ray, at + 1, level], share)
                 sent, sent2 = sent + sending * one_way, sent2 + sending * one_way * one_way
                 heard, heard2 = heard + hearing * one_way, heard2 + hearing * one_way * one_way
                 weight = (sending + hearing) * max(one_way, FAINT)
-                x = start - line
                 there, delay, sdd = there + weight, delay + weight * d, sdd + weight * d * d
                 sx, sxx, sxd = sx + weight * x, sxx + weight * x * x, sxd + weight * x * d
             both = every_sent * every_heard
             late, tilt, left = _line_of_delays(max(there, 1e-30), delay, sdd, sx, sxx, sxd)
-            out.shown_mm[line, level] = step * level + late
-            out.amplitude[line, level] = np.sqrt(sent * heard / both) * (sent2 * heard2 / both) ** 0.25
-            out.shift_mm[line, level] = tilt / pitch_mm * step * level if refract else 0.0
-            out.focus[line, level] = np.exp(-2 * (wavenumber * wavenumber) * left)
-            for k in range(before + 1, level):
-                part = np.float32((k - before) / (level - before))
-                for table in (out.shown_mm, out.amplitude, out.shift_mm, out.focus):
-                    table[line, k] = between(table[line, before], table[line, level], part)
-            before = level
+            means.shown_mm[line, mark] = depth + late
+            means.amplitude[line, mark] = np.sqrt(sent * heard / both) * (sent2 * heard2 / both) ** 0.25
+            means.shift_mm[line, mark] = tilt / pitch_mm * depth if refract else 0.0
+            means.focus[line, mark] = np.exp(-2 * (wavenumber * wavenumber) * left)
+
+
+@kernel
+def _fill(first, end, paths, means):
+    """Fill the levels between those of the averages."""
+    marks = means.labels.shape[1]
+    for line in range(first, end):
+        for level in range(paths.labels.shape[1]):
+            at = min(level // STRIDE, marks - 2)
+            share = np.float32((level - STRIDE * at) / STRIDE)
+            paths.shown_mm[line, level] = between(means.shown_mm[line, at], means.shown_mm[line, at + 1], share)
+            share = min(share, np.float32(1.0))
+            paths.amplitude[line, level] = between(means.amplitude[line, at], means.amplitude[line, at + 1], share)
+            paths.shift_mm[line, level] = between(means.shift_mm[line, at], means.shift_mm[line, at + 1], share)
+            paths.focus[line, level] = between(means.focus[line, at], means.focus[line, at + 1], share)
+            paths.edges[line, level] = between(means.edges[line, at], means.edges[line, at + 1], share)

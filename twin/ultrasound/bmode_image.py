@@ -48,23 +48,19 @@ def _shares_of_focus(transducer: Transducer, beam: Beam, paths: Paths) -> NDArra
     """Amplitude of the sharp beam : (1, rows, lines); of several rays also of the blunt one, as tissues leave of it."""
     if transducer.aperture_rays == 1:
         return np.ones((1, len(beam.lateral), len(paths.focus)), np.float32)
-    wide = blunt(transducer)
-    focus, edges = _as_shown(paths, transducer)
-    inner, energies = (beam.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(beam.lateral) ** 2).sum(axis=1)
-    alike = inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1))  # of the same scatterers
-    both = np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike.astype(np.float32)[:, None])
-    evened = np.sqrt(beam.lateral_energy / wide.lateral_energy).astype(np.float32)[:, None]
-    return np.stack([np.sqrt(focus), evened * np.sqrt(1 - focus)]) / both * edges
+    shares = np.empty((2, len(beam.lateral), len(paths.focus)), np.float32)
+    alike, evened = _blunt_beside_sharp(transducer)
+    in_threads(_share, len(paths.focus), shares, paths, transducer.rows_mm, lines_of(transducer).pitch_mm, alike, evened)
+    return shares
 
 
-def _as_shown(paths: Paths, transducer: Transducer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Focus and edges : (rows, lines) of the places that are shown there: of other depths, and aside."""
-    rows, lines = transducer.rows_mm, np.arange(len(paths.focus))
-    deep = np.maximum.accumulate(paths.shown_mm, axis=1)  # behind what slows sound down it may seem to turn back
-    levels = np.rint([np.interp(rows, one, np.arange(len(one))) for one in deep]).astype(int)  # (lines, rows)
-    aside = np.rint(paths.shift_mm[lines[:, None], levels] / lines_of(transducer).pitch_mm).astype(int)
-    place = np.clip(lines[:, None] + aside, 0, len(lines) - 1)
-    return paths.focus[place, levels].T, paths.edges[place, levels].T
+@lru_cache(maxsize=8)
+def _blunt_beside_sharp(transducer: Transducer) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Correlation of both beams' echoes of the same scatterers, and the root of their powers, sharp over blunt : (rows,)."""
+    sharp, wide = beam_of(transducer), blunt(transducer)
+    inner, energies = (sharp.lateral * wide.lateral.conj()).sum(axis=1).real, (np.abs(sharp.lateral) ** 2).sum(axis=1)
+    alike = inner / np.sqrt(energies * (np.abs(wide.lateral) ** 2).sum(axis=1))
+    return alike.astype(np.float32), np.sqrt(sharp.lateral_energy / wide.lateral_energy).astype(np.float32)
 
 
 @lru_cache(maxsize=9)  # as many as the most directions
@@ -213,6 +209,23 @@ def _in_depth(first, end, pulses, samples, axial):
             weight = axial[r, t]
             for line in range(pulses.shape[1]):
                 pulses[r, line] += weight * samples[start + t, line]
+
+
+@kernel(fastmath=True)
+def _share(first, end, shares, paths, rows_mm, pitch_mm, alike, evened):
+    """Share the echoes of some lines among both beams, by the focus of the places shown there: of other depths, and aside."""
+    count, levels = paths.focus.shape
+    for line in range(first, end):
+        level, deep = 0, paths.shown_mm[line, 0]
+        for row in range(len(rows_mm)):
+            while level < levels - 1 and (deep + paths.shown_mm[line, level + 1]) / 2 < rows_mm[row]:
+                level += 1
+                deep = max(deep, paths.shown_mm[line, level])  # behind what slows sound down it may seem to turn back
+            place = min(max(line + int(np.rint(paths.shift_mm[line, level] / pitch_mm)), 0), count - 1)
+            focus = paths.focus[place, level]
+            left = paths.edges[place, level] / np.sqrt(1 + 2 * np.sqrt(focus * (1 - focus)) * alike[row])
+            shares[0, row, line] = np.sqrt(focus) * left
+            shares[1, row, line] = evened[row] * np.sqrt(1 - focus) * left
 
 
 @kernel(fastmath=True)

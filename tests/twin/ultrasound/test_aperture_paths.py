@@ -114,7 +114,9 @@ def test_a_constant_shift_stays_to_both_ends():
     """By the same amplitude: lines neither crowd nor part."""
     found = paths()
     for shift in (1.0, -1.0):
-        moved = _evened(found._replace(shift_mm=np.full_like(found.shift_mm, shift)), np.full(found.labels.shape[1], 6.0), 0.1229)
+        moved = _evened(
+            found._replace(shift_mm=np.full_like(found.shift_mm, shift)), np.full(found.labels.shape[1], 0.74), 0.1229
+        )
         np.testing.assert_allclose(moved.shift_mm, shift, atol=1e-5)
         np.testing.assert_allclose(moved.amplitude, found.amplitude, rtol=1e-5)
 
@@ -123,13 +125,13 @@ def test_edges_of_a_shadow_are_kept_where_the_beam_blurs_them():
     """The beam's mean power across a step is nearer to the step with the factor; even tissue, weak or not, has none."""
     spread = beam(ARRAY)
     step = np.where(np.arange(321)[:, None] < 160, 1.0, 0.01) * np.ones((1, 408), np.float32)
-    factor = _edges(step.astype(np.float32), ARRAY.scale_mm_per_px[1], spread)[:, 300]
+    factor = _edges(step.astype(np.float32), 0.1225, spread, 0.1225)[:, 300]
     share = np.abs(spread.lateral[300]) ** 2 / (np.abs(spread.lateral[300]) ** 2).sum()
     blurred = np.sqrt(np.convolve(np.pad(step[:, 300] ** 2, 32, mode="edge"), share, mode="valid"))
     off = [np.abs(kept - step[:, 300])[140:180].sum() for kept in (blurred, blurred * factor)]
     assert off[0] > 1.3 * off[1]
     for level in (1.0, 1e-4):
-        np.testing.assert_allclose(_edges(np.full((321, 408), level, np.float32), 0.1225, spread), 1, atol=1e-4)
+        np.testing.assert_allclose(_edges(np.full((321, 408), level, np.float32), 0.1225, spread, 0.1225), 1, atol=1e-4)
 
 
 def test_a_ragged_layer_spoils_the_focus():
