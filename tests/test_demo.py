@@ -42,10 +42,13 @@ SMALL = (  # cameras at half their size: fringes of ten pixels a period
     "board_samples=2",
     "film_frames=0",  # a camera of half the size shows the tracker half a target
 )
-COARSE = [  # B-scans of half the lines and two thirds of the rows
-    f"{part}.{field}"
-    for part in ("rig.probe", "ultrasound")
-    for field in ("image_size=[161,272]", "scale_mm_per_px=[0.2458,0.18375]")
+COARSE = [  # B-scans of half the lines and two thirds of the rows, too few for beams from several directions
+    "ultrasound=linear",
+    *(
+        f"{part}.{field}"
+        for part in ("rig.probe", "ultrasound")
+        for field in ("image_size=[161,272]", "scale_mm_per_px=[0.2458,0.18375]")
+    ),
 ]
 MADE = ("report.html", "surface.ply", "surface.glb", "metrics.json", "result/optics/calibration.html", "truth/board.npz")
 MADE_INSIDE = (
