@@ -175,6 +175,7 @@ COMMANDS = (
     Command("import", ("folder=published",), ("published",),
             ("published/SLdata/images/3.png",)),
     Command("export", ("layout=us_calibration", "capture=wires/capture"), ("wires",), _sweep("wires")),
+    Command("export", ("layout=screen", "capture=scan/capture"), ("scan",), SCAN),
     Command("import", ("layout=us_calibration", "folder=sets"), ("sets",),
             ("sets/data1/UScrop/US3.png",)),
     Command("import", ("layout=stereo_basler", "folder=sets/data1"), ("sets",), ("sets/data1/UScrop/US3.png",)),

@@ -43,6 +43,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "freehand": {"sequence.igs.mha"},
     "import": {""},
     "import-sweep": {""},
+    "export": {"screen", "poses.csv"},  # of layout=screen
     "describe": {""},
     "reconstruct": {"", "optics/optics.yaml"},
 }

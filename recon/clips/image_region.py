@@ -1,4 +1,7 @@
-"""The B-scan's part of a scanner's screen: what changes from frame to frame, less what is small, such as a clock."""
+"""The B-scan's part of a scanner's screen: what changes from frame to frame, less what is small, such as a clock.
+
+The face's ringing above it never changes: bright rows as wide as the B-scan. A frame or a header is wider, or apart from it.
+"""
 
 from collections.abc import Iterable
 
@@ -12,7 +15,7 @@ from recon.model.fan import Mask, box
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
-    """The box about the largest part that changes, from frames : (h, w) of one size.
+    """The box about the largest part that changes, with the face's ringing above it, from frames : (h, w) of one size.
 
     field : that a message names, by which the part is given
 
@@ -21,11 +24,33 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
     InputError
         If nothing of some size changes.
     """
+    mean, deviation = over_time(frames)
+    u, v, width, height = box(changing(deviation, name, field))
+    top = _ringing(mean, u, v, width)
+    return _whole_or((u, top, width, height + v - top), mean.shape)
+
+
+def find_below_ringing(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
+    """The same without the ringing, where echoes are looked for."""
     _, deviation = over_time(frames)
-    part = changing(deviation, name, field)
-    (tall, wide), (u, v, width, height) = part.shape, box(part)
+    return _whole_or(box(changing(deviation, name, field)), deviation.shape)
+
+
+def _ringing(mean: NDArray[np.float32], u: int, v: int, width: int) -> int:
+    """The first row of those right above row v that are bright across the part's width, and dark on both sides, in the mean."""
+    bright_dn, nearly_all, beside_px = 8.0, 0.9, 3
+    bright = mean[:v] > bright_dn
+    within = bright[:, u : u + width].mean(axis=1) > nearly_all
+    beyond = np.hstack([bright[:, max(u - beside_px, 0) : u], bright[:, u + width : u + width + beside_px]]).any(axis=1)
+    others = np.flatnonzero(~within | beyond)
+    return int(others[-1]) + 1 if others.size else 0
+
+
+def _whole_or(part: Box, shape: tuple[int, ...]) -> Box:
+    """The part, or all of a screen (h, w) of which it is nearly all."""
     whole = 0.9  # share of the screen along both sides, from which on nothing is cut away
-    return (0, 0, wide, tall) if width > whole * wide and height > whole * tall else (u, v, width, height)
+    (tall, wide), (_, _, width, height) = shape, part
+    return (0, 0, wide, tall) if width > whole * wide and height > whole * tall else part
 
 
 def changing(deviation: NDArray[np.float32], name: str, field: str) -> Mask:

@@ -155,7 +155,7 @@ def bottom_depths(sweep: Sweep, clip: Clip, top_px: int, fan: Fan | None = None)
 def part_of_screen(sweep: Sweep, top_px: int) -> Clip | None:
     """The part of a screen that changes, with the rows above it that are left out anyway; None if that is all, or nothing."""
     try:
-        u, v, width, height = image_region.find(sweep.images(), sweep.name, "clip=[u,v,width,height]")
+        u, v, width, height = image_region.find_below_ringing(sweep.images(), sweep.name, "clip=[u,v,width,height]")
     except InputError:
         return None
     above = min(v, top_px)

@@ -18,6 +18,8 @@ from recon.model.rig import Part, Positive
 from recon.model.tracks import LagSeconds
 from sonotwin.folder_lists import Folders
 
+ScreenPixels = Annotated[int, Field(ge=320, le=8192)]
+
 
 def _known(name: object) -> object:
     """The name of a layout of whole captures, or of a dialect of cameras that is written; else a refusal."""
@@ -29,11 +31,11 @@ class Settings(Part):
 
     layout: Annotated[str, PlainValidator(_known)] = "meza2021"
     """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; markerpose: their networks'
-    training data, and their example's; a program's name, such as kalibr, ros, mrcal, slstudio: the calibration of cameras and
-    projector alone"""
+    training data, and their example's; screen: a scanner's recording, for import-sweep; a program's name, such as kalibr, ros,
+    mrcal, slstudio: the calibration of cameras and projector alone"""
     capture: Folders = Field(default=[])
-    """a capture folder, which meza2021 needs; of a sweep one with poses, as `sonotwin track` leaves it. us_calibration takes
-    several, a set each: [first,second]"""
+    """a capture folder, which meza2021 and screen need; of a sweep one with poses, as `sonotwin track` leaves it. us_calibration
+    takes several, a set each: [first,second]"""
     out: Path
     """folder; gets SLdata/, USdata/ and the files of calibrations, as far as the capture has them"""
     calibration: Path | None = None
@@ -62,6 +64,8 @@ class Settings(Part):
     networks: Folders = Field(default=[])
     """folders with detector.pt and segmenter.pt of the published shape, as of `sonotwin train network=published_detector`, or
     shipped, those that come with sonotwin; they go out by the names that the scripts load"""
+    screen_px: tuple[ScreenPixels, ScreenPixels] = (1024, 768)
+    """width, height of screens, px, 320 to 8192 each; B-scans keep their size on it. The default is that of many scanners"""
 
     @property
     def source(self) -> Path:

@@ -8,9 +8,12 @@ their calibration of the probe: data1, data2, ... of a capture each, with L, R, 
 the crossings found, beside cam1_cam2.npz and their config.yaml. The pose is that of the frames in L/ and R/, taken a little
 before or after the B-scan; `frames=false` writes B-scans alone, each with its own pose. `layout=markerpose` is for the training
 of their networks: of data sets, data_centers.csv with images/, patch120/ and mask120/; and for their example: of a film,
-images/L, R and StereoParams.xml. Reads a capture folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct`
-leave it, and results of other verbs for what a capture doesn't hold. B-scans without a pose are left out. Writes into the folder
-`out`; an earlier export there is replaced whole, and nothing else ever is. Takes seconds.
+images/L, R and StereoParams.xml. `layout=screen` is a scanner's own recording: screen/ of whole screens, with the B-scan in its
+place and a clock, and poses.csv, the tracker's table; prints the command by which `sonotwin import-sweep` reads them back.
+
+Reads a capture folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs
+for what a capture doesn't hold. B-scans without a pose are left out, but of a recording. Writes into the folder `out`; an earlier
+export there is replaced whole, and nothing else ever is. Takes seconds.
 
     sonotwin export capture=session/capture out=dataset
     sonotwin export layout=kalibr calibration=optics.yaml out=for_kalibr
@@ -19,6 +22,7 @@ leave it, and results of other verbs for what a capture doesn't hold. B-scans wi
     sonotwin export layout=us_calibration capture=[first/poses/wires,second/poses/wires] out=for_their_calibration
     sonotwin export layout=markerpose data=outputs/data out=for_their_training
     sonotwin export layout=markerpose capture=outputs/film/capture networks=[detector,segmenter] out=for_their_example
+    sonotwin export layout=screen capture=outputs/sweep/capture out=recording
 """
 
 from recon import registry

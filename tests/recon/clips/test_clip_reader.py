@@ -260,6 +260,28 @@ def test_the_b_scan_is_what_changes_on_the_screen(moved):
     assert image_region.find(shown, "screen", "crop=...") == pytest.approx((u + moved[0], v + moved[1], width, height), abs=2)
 
 
+@pytest.mark.parametrize(("above", "belongs"), [
+    ((0, 0, 255, 210, 90), True),  # rows of the face's ringing, which never change
+    ((200, 0, 0), False),  # a line apart from it
+    ((255,), True),
+])  # fmt: skip
+def test_the_ringing_of_the_face_belongs_to_the_b_scan(above, belongs):
+    """It is as wide as the B-scan; what is wider is a frame or a header, and a bright background is on all sides."""
+    u, v, width, height = BOX
+    plain = np.zeros((12, *made_clips.SCREEN[::-1]), np.uint8)
+    plain[:, v : v + height, u : u + width] = made_clips.scans(12)
+    rows = np.array(above, np.uint8)[None, :, None]
+    ringing, wider, bright = plain.copy(), plain.copy(), np.maximum(plain, 40)
+    ringing[:, v - len(above) : v, u : u + width] = rows
+    wider[:, v - len(above) : v, u - 2 : u + width + 2] = rows
+    with_rows = np.count_nonzero(above) if belongs else 0
+    expected = (u, v - with_rows, width, height + with_rows)
+    assert image_region.find(ringing, "screen", "crop=...") == expected
+    assert image_region.find_below_ringing(ringing, "screen", "clip=...") == BOX
+    assert image_region.find(wider, "screen", "crop=...") == BOX
+    assert image_region.find(bright, "screen", "crop=...") == BOX
+
+
 def test_a_clip_that_is_all_b_scan_stays_whole():
     assert image_region.find(made_clips.scans(8), "clip", "crop=...") == (0, 0, *BOX[2:])
     with pytest.raises(InputError, match=r"still: expected a B-scan that changes .* give crop"):
