@@ -48,13 +48,13 @@ def over_aperture(paths: Paths, body: Body, transducer: Transducer, world_from_i
     depths = paths.step_mm * np.arange(levels)
     places = lines.pitch_mm * np.arange(count)
     poses = world_from_lines(lines, world_from_face(transducer, world_from_image), places)
-    along = np.zeros((2, rays, count, levels), np.float32)  # loss and delay down each ray
+    labels = np.ascontiguousarray(paths.labels[:, ::STRIDE])
+    along = np.zeros((2, rays, *labels.shape), np.float32)  # loss and delay down each ray, at every STRIDE-th level
     tissues, tangents = body.acoustics(transducer.frequency_mhz), _tangents(transducer)
     delays = paths.step_mm * (transducer.assumed_speed / tissues.speed - 1)
     spread = transducer.spectral_variance(depths)
     in_threads(_follow_rays, count, along, paths, body.packed(), tissues, delays, spread, poses, tangents, lines.pitch_mm)
     along[0, :, without_contact(paths, transducer)] = NOTHING
-    labels = np.ascontiguousarray(paths.labels[:, ::STRIDE])
     means = Paths(STRIDE * paths.step_mm, labels, *(np.empty(labels.shape, np.float32) for _ in range(5)))
     weights = _weights(transducer, depths[::STRIDE])
     in_threads(_gather, count, means, along, tangents, weights, lines.pitch_mm, transducer.wavenumber, transducer.refraction)
@@ -143,8 +143,9 @@ def _follow_rays(first, end, along, paths, solids, tissues, delays, spread, pose
                     here = there
                 absorbed += longer * step * tissues.loss[there]
                 delay += longer * delays[there]
-                along[0, ray, start, level] = passed - absorbed + low_frequencies(absorbed, spread[level])
-                along[1, ray, start, level] = delay
+                if level % STRIDE == 0:
+                    along[0, ray, start, level // STRIDE] = passed - absorbed + low_frequencies(absorbed, spread[level])
+                    along[1, ray, start, level // STRIDE] = delay
 
 
 @kernel
@@ -178,7 +179,7 @@ def _gather(first, end, means, along, tangents, weights, pitch_mm, wavenumber, r
     for line in range(first, end):
         means.shown_mm[line, 0], means.amplitude[line, 0], means.shift_mm[line, 0], means.focus[line, 0] = 0, 1, 0, 1
         for mark in range(1, means.labels.shape[1]):
-            level, depth = STRIDE * mark, means.step_mm * mark
+            depth = means.step_mm * mark
             every_sent = every_heard = sent = heard = sent2 = heard2 = 0.0
             there = delay = sx = sxx = sxd = sdd = 0.0
             for ray in range(rays):
@@ -189,8 +190,8 @@ def _gather(first, end, means, along, tangents, weights, pitch_mm, wavenumber, r
                     continue
                 at = min(int(line + x), count - 2)
                 share = line + x - at
-                one_way = np.exp(between(along[0, ray, at, level], along[0, ray, at + 1, level], share) / 2)
-                d = between(along[1, ray, at, level], along[1, ray, at + 1, level], share)
+                one_way = np.exp(between(along[0, ray, at, mark], along[0, ray, at + 1, mark], share) / 2)
+                d = between(along[1, ray, at, mark], along[1, ray, at + 1, mark], share)
                 sent, sent2 = sent + sending * one_way, sent2 + sending * one_way * one_way
                 heard, heard2 = heard + hearing * one_way, heard2 + hearing * one_way * one_way
                 weight = (sending + hearing) * max(one_way, FAINT)
