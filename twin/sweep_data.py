@@ -4,11 +4,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from recon.capture.manifest import MANIFEST, SCANNER, sweep_part
-from recon.errors import InputError
+from recon.errors import InputError, brief
 from scenes.catalogue import parse_scene
 from twin.engine import Engine, results
 from twin.filmed_sweep import SweepSettings, plan_sweep
-from twin.session import SETTINGS, Session, read_json
+from twin.session import SETTINGS, Session, first_difference, read_json
 from twin.ultrasound import sweep_session
 
 
@@ -18,13 +18,18 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
     Raises
     ------
     InputError
-        If something else is in the place of one.
+        If a sweep of other settings, or something else, is in the place of one.
     """
     found = []
     for number in range(count):
         one = _session(out, settings, number)
         path = one.truth.folder / SETTINGS
-        if not path.is_file() or not (one.capture / MANIFEST).is_file() or read_json(path) != one.settings:
+        if path.is_file() and (one.capture / MANIFEST).is_file():
+            name, wanted, there = first_difference(one.settings, read_json(path))
+            if name:
+                expected = f"expected {brief(wanted)} as in this run, found {brief(there)}, another sweep"
+                raise InputError(f"{path}: {name}: {expected}; choose another out")
+        else:
             one.check()
             found.append(number)
     return found

@@ -1,6 +1,7 @@
 """Many sweeps: each of its own patient and hand, resumed, and of the same bytes on any engine."""
 
 import hashlib
+import re
 
 import pytest
 
@@ -35,11 +36,18 @@ def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
 
 
 def test_sweeps_that_are_there_are_kept(settings, tmp_path):
+    """None is made again, nor replaced by one of other settings."""
     assert sweep_data.missing(tmp_path, settings, 2) == [0, 1]
     assert list(sweep_data.make(tmp_path, settings, [0], Engine())) == [3]
     assert sweep_data.missing(tmp_path, settings, 2) == [1]
-    other = settings.model_copy(update={"seed": 5})
-    assert sweep_data.missing(tmp_path, other, 1) == [0]
+    for change, difference in (
+        ({"seed": 5}, "seed: expected 5 as in this run, found 4"),
+        ({"path": Hold(seconds=0.2)}, "path.seconds: expected 0.2 as in this run, found 0.1"),
+        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found None"),
+    ):
+        there = f"{tmp_path / '000000' / 'truth' / 'settings.json'}: {difference}, another sweep; choose another out"
+        with pytest.raises(InputError, match=rf"^{re.escape(there)}$"):
+            sweep_data.missing(tmp_path, settings.model_copy(update=change), 1)
 
 
 def test_foreign_files_are_not_replaced(settings, tmp_path):
