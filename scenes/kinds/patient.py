@@ -1,8 +1,10 @@
 """A patient on her back: a breast grown from a seed, on a chest with muscle, ribs and lung, and masses as radiologists say.
 
-Masses lie in what has grown as they are: touching, in clusters, in gland or fat. The skin is that of the breast phantom.
+Masses lie in what has grown as they are: touching, in clusters, in gland or fat, but none about another's middle. The skin is
+that of the breast phantom.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Literal
 
@@ -10,12 +12,13 @@ import numpy as np
 import trimesh
 from pydantic import Field
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
-from scenes.kinds.breast import Outside, albedo, check_depth, closed, form_of, world_from_phantom
+from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, form_of, world_from_phantom
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
@@ -116,7 +119,7 @@ def build(config: Config) -> Scene:
     Raises
     ------
     InputError
-        If a mass lies too near to the skin or to the chest, or outside.
+        If a mass lies too near to the skin or to the chest, or outside, or one has another's middle in it.
     """
     shape_rng, colour_rng, mass_rng = np.random.default_rng(config.seed).spawn(3)
     skin = dome(form_of(config), shape_rng)
@@ -131,15 +134,29 @@ def build(config: Config) -> Scene:
         ),
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
+    bodies: list[trimesh.Trimesh] = []
     for k, (wanted, rng) in enumerate(zip(config.masses, mass_rng.spawn(len(config.masses)), strict=True)):
         lying = _flattened(mass(wanted.form, wanted.size_mm, rng), FLAT[wanted.form])
         body = solid_meshes.moved(lying, rigid.transform(np.eye(3), wanted.centre_mm))
         check_depth(f"masses.{k}", body, skin, config.least_mm)
+        bodies.append(body)
+        _check_middles(config.masses, bodies)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
     return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world))
+
+
+def _check_middles(masses: Sequence[Mass], bodies: Sequence[trimesh.Trimesh]) -> None:
+    """Refuse the last of some masses if its middle lies in an earlier one, or one's in it: they may touch, but hide no other."""
+    last = len(bodies) - 1
+    for other in range(last):
+        pairs = ((masses[last], bodies[other]), (masses[other], bodies[last]))
+        inside_mm = max(depth(np.array([mass.centre_mm]), body)[0] for mass, body in pairs)
+        if inside_mm > 0:
+            expected = f"expected its middle outside of masses.{other}, and that one's outside of it"
+            raise InputError(f"masses.{last}: {expected}, found one {inside_mm:.1f} mm within")
 
 
 def _flattened(body: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
