@@ -25,7 +25,8 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
         one = _session(out, settings, number)
         path = one.truth.folder / SETTINGS
         if path.is_file() and (one.capture / MANIFEST).is_file():
-            name, wanted, there = first_difference(one.settings, read_json(path))
+            wanted_first = {"seed": one.settings["seed"], **one.settings}  # the seed, by which scenes differ, too
+            name, wanted, there = first_difference(wanted_first, read_json(path))
             if name:
                 expected = f"expected {brief(wanted)} as in this run, found {brief(there)}, another sweep"
                 raise InputError(f"{path}: {name}: {expected}; choose another out")
@@ -51,10 +52,16 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
 
 
 def numbered(settings: SweepSettings, number: int) -> SweepSettings:
-    """The settings of a sweep: of another seed, and of another patient where a scene is drawn by a seed."""
-    scene = settings.scene
-    if "seed" in type(parse_scene(scene)[1]).model_fields:
-        scene = scene | {"seed": parse_scene(scene)[1].seed + number}
+    """The settings of a sweep: of another seed, and of another patient where a scene is drawn by one, also with its own masses.
+
+    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Masses that are given are kept.
+    """
+    scene, parsed = settings.scene, parse_scene(settings.scene)[1]
+    usual = type(parsed).model_fields
+    if "seed" in usual:
+        scene = scene | {"seed": parsed.seed + settings.seed + number}
+    if "masses" in usual and parsed.masses == usual["masses"].default:
+        scene = scene | {"masses": "drawn"}
     return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
 
 

@@ -15,9 +15,9 @@ With `living=patient` she breathes, her heart beats, and soft tissue yields to t
 expiration, is that of the fringes. OUT/truth/sweep/living.npz says where chest and masses were at each image, and where the
 points that its pixels show rest. Elasticity takes a quarter of a minute to set up and 2 GB of memory, for each worker.
 
-With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds from `seed` on, each of another patient with masses
-as `scene.masses` has them. A run that was stopped goes on where it was, and one of other settings is refused; any engine gives
-the same bytes.
+With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds from `seed` on, each of another patient: of
+`scene.seed` plus the sweep's seed, with masses drawn by it unless `scene.masses` are given; OUT/*/truth/scene.json has them. A
+run that was stopped goes on where it was, and one of other settings is refused; any engine gives the same bytes.
 
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
 B-scans that they are led to. Poses are found where both cameras have the body's target in view: a line for each body says in how

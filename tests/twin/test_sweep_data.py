@@ -29,10 +29,18 @@ def digest(folder):
 
 def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
     later = sweep_data.numbered(settings, 3)
-    assert (later.seed, later.scene["seed"]) == (7, 10)
+    assert (later.seed, later.scene["seed"]) == (7, 14), "of the seed 7 of scenes, and of 4 + 3"
     assert later.path == settings.path
     cut = sweep_data.numbered(settings.model_copy(update={"scene": {"kind": "sphere"}}), 3)
     assert cut.scene == {"kind": "sphere"}
+
+
+def test_patients_have_drawn_masses_unless_they_are_given(settings):
+    given = [{"size_mm": 9.0, "centre_mm": (0.0, 0.0, 20.0)}]
+    for masses, expected in (({}, "drawn"), ({"masses": given}, given), ({"masses": []}, [])):
+        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, **masses}})
+        scenes = [sweep_data.numbered(chosen, number).scene for number in range(2)]
+        assert [scene["seed"] for scene in scenes] == [24, 25] and [scene["masses"] for scene in scenes] == [expected] * 2
 
 
 def test_sweeps_that_are_there_are_kept(settings, tmp_path):

@@ -57,6 +57,19 @@ def test_masses_may_touch():
     assert sum(thing.inside for thing in built(masses=cluster).things) == 2
 
 
+def test_drawn_masses_are_the_seeds_and_are_told():
+    """Other ones by another seed, and those that are told, given by hand, are the same bodies."""
+    first = built(masses="drawn", seed=8)
+    again = built(masses=first.drawn["masses"], seed=8)
+    pairs = zip(first.things, again.things, strict=True)
+    assert all((one.mesh.vertices == two.mesh.vertices).all() and one.tissue == two.tissue for one, two in pairs)
+    assert again.drawn is None and 2 <= len(first.drawn["masses"]) <= 3
+    config = patient.Config(**COARSE, seed=9)
+    others = patient.draw_masses(config, patient.skin_of(config), np.random.default_rng([9, 2]))
+    assert all(8 <= one.size_mm <= 20 for one in others)
+    assert not {one.centre_mm[0] for one in others} & {one["centre_mm"][0] for one in first.drawn["masses"]}
+
+
 def test_layers_lie_in_the_world_and_are_the_same_each_time():
     scene = built(masses=[])
     first, second = scene.layers(), scene.layers()
