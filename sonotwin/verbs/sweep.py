@@ -99,6 +99,7 @@ def run(config: Config) -> None:
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
     session.check()
+    console.print(f"scene       {config.scene.get('kind', 'of no kind')}, setting it up")
     with console.status("setting up the scene"):
         planned = plan_sweep(config)
         film = filming(planned, console) if config.filmed else None
@@ -124,6 +125,8 @@ def render_many(config: Config, console: Console) -> None:
     numbers = sweep_data.missing(config.out, settings, config.count)
     if len(numbers) < config.count:
         console.print(f"found       {config.count - len(numbers)} sweeps")
+    if numbers:
+        console.print(f"scene       {config.scene['kind']}, setting it up for each of {len(numbers)} sweeps")
     total = 0
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         made = sweep_data.make(config.out, settings, numbers, config.engine)
