@@ -1,14 +1,16 @@
 """Data sets of sweeps: each of its own patient and hand, in a folder of its own, whatever the engine and its workers."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import suppress
 from pathlib import Path
 
 from recon.capture.manifest import MANIFEST, SCANNER, sweep_part
 from recon.errors import InputError, brief
+from recon.files import atomic
 from scenes.catalogue import parse_scene
 from twin.engine import Engine, results
 from twin.filmed_sweep import SweepSettings, plan_sweep
-from twin.session import SETTINGS, Session, first_difference, read_json
+from twin.session import CAPTURE, SETTINGS, TRUTH, Session, first_difference, read_json
 from twin.ultrasound import sweep_session
 
 
@@ -36,9 +38,18 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
     return found
 
 
-def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Iterator[int]:
-    """Render sweeps; gives the B-scans of each as it is done."""
-    return results(engine, write, ((out, settings, number) for number in numbers))
+def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:
+    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary is left."""
+    try:
+        yield from results(engine, write, ((out, settings, number) for number in numbers))
+    finally:
+        for number in numbers:  # of workers that were ended with this process
+            folder = out / _name(number)
+            atomic.restore((folder / TRUTH, folder / CAPTURE))
+            with suppress(OSError):
+                folder.rmdir()
+        with suppress(OSError):
+            out.rmdir()
 
 
 def write(out: Path, settings: SweepSettings, number: int) -> int:
@@ -46,7 +57,7 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
     try:
         planned = plan_sweep(numbered(settings, number))
     except InputError as error:
-        raise InputError(f"sweep {number:06d}: {error}") from None
+        raise InputError(f"sweep {_name(number)}: {error}") from None
     planned.write(_session(out, settings, number), planned.scans())
     return len(planned.plan.times)
 
@@ -65,8 +76,13 @@ def numbered(settings: SweepSettings, number: int) -> SweepSettings:
     return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
 
 
+def _name(number: int) -> str:
+    return f"{number:06d}"
+
+
 def _session(out: Path, settings: SweepSettings, number: int) -> Session:
     chosen = numbered(settings, number)
-    name = f"{number:06d}"
     purpose = sweep_session.PURPOSES[chosen.path.kind] if chosen.name else None
-    return Session(out / name, sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,), purpose=purpose)
+    return Session(
+        out / _name(number), sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,), purpose=purpose
+    )

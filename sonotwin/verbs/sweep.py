@@ -38,6 +38,7 @@ many, and warns of none.
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
@@ -128,8 +129,10 @@ def render_many(config: Config, console: Console) -> None:
     if numbers:
         console.print(f"scene       {config.scene['kind']}, setting it up for each of {len(numbers)} sweeps")
     total = 0
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        made = sweep_data.make(config.out, settings, numbers, config.engine)
+    with (
+        Progress(console=console, transient=True, disable=not console.is_terminal) as progress,
+        closing(sweep_data.make(config.out, settings, numbers, config.engine)) as made,
+    ):
         for images in progress.track(made, total=len(numbers), description="rendering sweeps"):
             total += images
     console.print(f"render      {len(numbers)} sweeps, {total} B-scans, {perf_counter() - start:.1f} s")

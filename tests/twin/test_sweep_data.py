@@ -66,6 +66,30 @@ def test_foreign_files_are_not_replaced(settings, tmp_path):
         sweep_data.missing(tmp_path, settings, 2)
 
 
+def test_what_workers_had_begun_goes_away_when_one_is_refused(settings, tmp_path, monkeypatch):
+    """They are ended with what they hold; what others have put there stays."""
+
+    def refused(engine, work, tasks):
+        yield 3
+        for number, (out, _, _) in enumerate(tasks):
+            for name in ("truth", "capture"):
+                (out / f"{number:06d}" / f".{name}.4194305.new").mkdir(parents=True)  # above the largest process number
+                (out / f"{number:06d}" / f".{name}.lock").write_text("")
+        raise InputError("refused")
+
+    monkeypatch.setattr(sweep_data, "results", refused)
+    (tmp_path / "shared" / "000001").mkdir(parents=True)
+    (tmp_path / "shared" / "000001" / "notes.txt").write_text("mine", encoding="utf-8")
+    for name in ("own", "shared"):
+        with pytest.raises(InputError, match="refused"):
+            list(sweep_data.make(tmp_path / name, settings, [0, 1], Engine()))
+    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == [
+        "shared",
+        "shared/000001",
+        "shared/000001/notes.txt",
+    ]
+
+
 @pytest.mark.slow
 def test_engines_give_the_same_bytes(settings, tmp_path):
     for name, engine in (("one", Engine()), ("two", Engine(workers=2)), ("dask", Engine(name="dask", workers=2))):
