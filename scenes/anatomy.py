@@ -19,6 +19,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.spatial import KDTree
 
 from recon.geometry import rigid
+from recon.geometry.surface_tree import nearest
 from recon.model.rig import Part, Positive
 from scenes.dome import Dome
 from scenes.scene_types import Layer
@@ -197,9 +198,9 @@ def _depth_under(skin: Dome, grid: Grid) -> Volume:
     near = (np.abs(depth) < 5) & (z > 0)
     facet_mm = float(np.linalg.norm(np.diff(skin.vertices[skin.faces[:, :2]], axis=1), axis=2).max())
     points = grid.points()[near.ravel()]
-    distance, nearest = KDTree(skin.vertices).query(points, distance_upper_bound=5 + facet_mm, workers=-1)
+    distance, chosen = nearest(KDTree(skin.vertices), points, farthest=5 + facet_mm)
     met = np.isfinite(distance)
-    vertex = np.where(met, nearest, 0)
+    vertex = np.where(met, chosen, 0)
     along = np.einsum("ij,ij->i", skin.vertices[vertex] - points, _normals(skin)[vertex])
     by_facet = np.where(distance < max(3.0, 2 * facet_mm), along, np.sign(along) * distance)
     depth[near] = np.where(met, by_facet, depth[near])
@@ -266,8 +267,8 @@ def _lobules(anatomy: Anatomy, grid: Grid, noise: _Noise, strata: Volume) -> _Lo
     low, high = (bound(scaled.reshape(-1, 3), axis=0) for bound in (np.min, np.max))
     cells = np.stack(np.meshgrid(*(np.arange(np.floor(a) - 1, np.ceil(b) + 2) for a, b in zip(low, high, strict=True))), axis=-1)
     seeds = cells.reshape(-1, 3) + 0.5 + noise.rng.uniform(-0.42, 0.42, (cells.size // 3, 3))
-    distance, nearest = KDTree(seeds).query(scaled.reshape(-1, 3).astype(np.float32), k=5, workers=-1)
-    return _Lobules(np.asarray(nearest), np.asarray(distance), len(seeds), grid, wide)
+    distance, chosen = nearest(KDTree(seeds), scaled.reshape(-1, 3).astype(np.float32), 5)
+    return _Lobules(chosen, distance, len(seeds), grid, wide)
 
 
 def _gland(
@@ -390,8 +391,8 @@ def _ducts(anatomy: Anatomy, grid: Grid, gland: Volume, nipple: Array, rng: np.r
                 if 8 < left < 45 and rng.random() < 0.03:
                     aside = heading + 0.6 * rng.standard_normal(3)
                     branches.append((place, aside / np.linalg.norm(aside), left - 5))
-    distance, nearest = KDTree(np.array(places)).query(grid.points(), distance_upper_bound=REACH_MM + 2, workers=-1)
-    radius = np.append(radii, 0.0)[nearest]
+    distance, chosen = nearest(KDTree(np.array(places)), grid.points(), farthest=REACH_MM + 2)
+    radius = np.append(radii, 0.0)[chosen]
     tube = np.where(np.isfinite(distance), distance - radius, REACH_MM).reshape(grid.shape)
     return _cut(np.maximum(tube, gland))
 

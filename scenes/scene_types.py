@@ -3,8 +3,9 @@
 World is the frame of camera 1, lengths in mm: z points away from the camera into the scene, x right and y down in the image.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -102,3 +103,4 @@ class Scene:
     things: tuple[Thing, ...]
     shapes: tuple[Shape, ...] = ()
     layers: Callable[[], Layers] | None = None  # grows them for ultrasound, which takes seconds; the same each time
+    drawn: Mapping[str, Any] | None = None  # what its seed has drawn, as fields of its kind, for the truth

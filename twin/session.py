@@ -184,12 +184,13 @@ class Session:
 
 
 def describe(scene: Scene, **more: object) -> dict[str, object]:
-    """Describe a scene for evaluation: its name, what a part adds, such as the names of its labels, and the primitives to fit."""
+    """Describe a scene for evaluation: its name, what was drawn, what a part adds, such as names of labels, and primitives."""
     shapes = []
     for shape in scene.shapes:
         values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
         shapes.append({"kind": type(shape).__name__.lower(), **values})
-    return {"name": scene.name, **more, "shapes": shapes}
+    drawn = {"drawn": dict(scene.drawn)} if scene.drawn else {}
+    return {"name": scene.name, **drawn, **more, "shapes": shapes}
 
 
 def write_json(path: Path, content: object) -> None:

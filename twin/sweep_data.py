@@ -1,14 +1,16 @@
 """Data sets of sweeps: each of its own patient and hand, in a folder of its own, whatever the engine and its workers."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import suppress
 from pathlib import Path
 
 from recon.capture.manifest import MANIFEST, SCANNER, sweep_part
-from recon.errors import InputError
+from recon.errors import InputError, brief
+from recon.files import atomic
 from scenes.catalogue import parse_scene
 from twin.engine import Engine, results
 from twin.filmed_sweep import SweepSettings, plan_sweep
-from twin.session import SETTINGS, Session, read_json
+from twin.session import CAPTURE, SETTINGS, TRUTH, Session, first_difference, read_json
 from twin.ultrasound import sweep_session
 
 
@@ -18,21 +20,36 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
     Raises
     ------
     InputError
-        If something else is in the place of one.
+        If a sweep of other settings, or something else, is in the place of one.
     """
     found = []
     for number in range(count):
         one = _session(out, settings, number)
         path = one.truth.folder / SETTINGS
-        if not path.is_file() or not (one.capture / MANIFEST).is_file() or read_json(path) != one.settings:
+        if path.is_file() and (one.capture / MANIFEST).is_file():
+            wanted_first = {"seed": one.settings["seed"], **one.settings}  # the seed, by which scenes differ, too
+            name, wanted, there = first_difference(wanted_first, read_json(path))
+            if name:
+                expected = f"expected {brief(wanted)} as in this run, found {brief(there)}, another sweep"
+                raise InputError(f"{path}: {name}: {expected}; choose another out")
+        else:
             one.check()
             found.append(number)
     return found
 
 
-def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Iterator[int]:
-    """Render sweeps; gives the B-scans of each as it is done."""
-    return results(engine, write, ((out, settings, number) for number in numbers))
+def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:
+    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary is left."""
+    try:
+        yield from results(engine, write, ((out, settings, number) for number in numbers))
+    finally:
+        for number in numbers:  # of workers that were ended with this process
+            folder = out / _name(number)
+            atomic.restore((folder / TRUTH, folder / CAPTURE))
+            with suppress(OSError):
+                folder.rmdir()
+        with suppress(OSError):
+            out.rmdir()
 
 
 def write(out: Path, settings: SweepSettings, number: int) -> int:
@@ -40,21 +57,32 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
     try:
         planned = plan_sweep(numbered(settings, number))
     except InputError as error:
-        raise InputError(f"sweep {number:06d}: {error}") from None
+        raise InputError(f"sweep {_name(number)}: {error}") from None
     planned.write(_session(out, settings, number), planned.scans())
     return len(planned.plan.times)
 
 
 def numbered(settings: SweepSettings, number: int) -> SweepSettings:
-    """The settings of a sweep: of another seed, and of another patient where a scene is drawn by a seed."""
-    scene = settings.scene
-    if "seed" in type(parse_scene(scene)[1]).model_fields:
-        scene = scene | {"seed": parse_scene(scene)[1].seed + number}
+    """The settings of a sweep: of another seed, and of another patient where a scene is drawn by one, also with its own masses.
+
+    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Masses that are given are kept.
+    """
+    scene, parsed = settings.scene, parse_scene(settings.scene)[1]
+    usual = type(parsed).model_fields
+    if "seed" in usual:
+        scene = scene | {"seed": parsed.seed + settings.seed + number}
+    if "masses" in usual and parsed.masses == usual["masses"].default:
+        scene = scene | {"masses": "drawn"}
     return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
+
+
+def _name(number: int) -> str:
+    return f"{number:06d}"
 
 
 def _session(out: Path, settings: SweepSettings, number: int) -> Session:
     chosen = numbered(settings, number)
-    name = f"{number:06d}"
     purpose = sweep_session.PURPOSES[chosen.path.kind] if chosen.name else None
-    return Session(out / name, sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,), purpose=purpose)
+    return Session(
+        out / _name(number), sweep_part(chosen.name), chosen.model_dump(mode="json"), devices=(SCANNER,), purpose=purpose
+    )

@@ -62,7 +62,7 @@ def new_folder(path: Path, by: str, adds: Addition | None = None) -> Iterator[Pa
 
 @contextmanager
 def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = MappingProxyType({})) -> Iterator[tuple[Path, ...]]:
-    """Give temporary folders to fill, one a place; on success all take their places, on failure all old folders stay.
+    """Give temporary folders to fill, one a place; on success all take their places, on failure all is as before.
 
     The last folder is exchanged with the old one at once, so that at every moment an old or a new one can be read. The others are
     set aside before and put in place after it, so that none stands beside another age of the last. Where a path is a link, the
@@ -81,7 +81,7 @@ def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = Mapp
         for path in sorted(paths):
             _check_no_file(path)
             _check_writable(path, path.parent)
-            path.parent.mkdir(parents=True, exist_ok=True)
+            locks.enter_context(_standing(path.parent))
             locks.enter_context(alone(path))
         _put_back(paths)
         for path in paths:
@@ -93,6 +93,20 @@ def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = Mapp
     for path in paths:
         if path not in additions and (others := written_files.foreign(path)):
             log.warning("%s: kept %s, which this run didn't write", path, ", ".join(others[:3]) + " ..." * (len(others) > 3))
+
+
+@contextmanager
+def _standing(folder: Path) -> Iterator[None]:
+    """Make a folder and those above it that are missing; on failure they go away again, but for what isn't empty."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for place in missing:
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 def begin_filled(folder: Path, by: str) -> None:

@@ -8,7 +8,6 @@ distance from the rough surface: unlike a blur of the image, this doesn't shrink
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from scipy.special import ndtr
 
 from recon.compiled import kernel, njit
 from recon.geometry import rigid
+from recon.geometry.surface_tree import nearest
 from recon.segmentation.echo_power import EchoPower
 from recon.threads import in_threads
 
@@ -136,14 +136,14 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
     k, j, i = np.nonzero((power.weight[part] > 0.01) & within)
     index = np.column_stack([i, j, k]) + low
     places = rigid.apply(volume.world_from_voxel, index)
-    away, nearest = KDTree(rough.vertices).query(places, distance_upper_bound=farthest, workers=numba.get_num_threads())
+    away, chosen = nearest(KDTree(rough.vertices), places, farthest=farthest)
     kept = np.isfinite(away)
-    places, nearest, index = places[kept], nearest[kept], index[kept]
-    distance = ((places - rough.vertices[nearest]) * rough.vertex_normals[nearest]).sum(axis=1)
+    places, chosen, index = places[kept], chosen[kept], index[kept]
+    distance = ((places - rough.vertices[chosen]) * rough.vertex_normals[chosen]).sum(axis=1)
     kept = np.abs(distance) < REACH_MM
     i, j, k = index[kept].T
     return (
-        nearest[kept],
+        chosen[kept],
         distance[kept],
         volume.voxels[k, j, i].astype(float),
         power.weight[k, j, i].astype(float),

@@ -9,7 +9,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from recon.files import meshes as mesh_files
-from recon.geometry.surface_tree import surface_tree
+from recon.geometry.surface_tree import nearest, surface_tree
 
 Array = NDArray[np.float64]
 
@@ -87,13 +87,13 @@ def below(points: Array, surface: trimesh.Trimesh, camera: ArrayLike = (0.0, 0.0
         As of `Containment`.
     """
     points = np.asarray(points, float)
-    _, nearest = surface_tree(surface.vertices).query(points, workers=-1)
-    vertices, normals = np.asarray(surface.vertices[nearest]), np.asarray(surface.vertex_normals[nearest])
+    _, chosen = nearest(surface_tree(surface.vertices), points)
+    vertices, normals = np.asarray(surface.vertices[chosen]), np.asarray(surface.vertex_normals[chosen])
     away = vertices - np.asarray(camera, float)
     normals = normals * np.where((normals * away).sum(axis=1) > 0, -1, 1)[:, None]  # towards the camera
     behind = -((points - vertices) * normals).sum(axis=1)  # from the tangent plane there
     sigmas = np.asarray(surface.vertex_attributes.get("sigma_mm", np.full(len(surface.vertices), np.nan)), float).ravel()
-    return np.where(_on_rim(surface, nearest), np.nan, behind), normals, sigmas[nearest]
+    return np.where(_on_rim(surface, chosen), np.nan, behind), normals, sigmas[chosen]
 
 
 def _on_rim(surface: trimesh.Trimesh, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from recon import threads
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Grid, grid_over
 from recon.geometry import rigid
+from recon.geometry.surface_tree import nearest
 
 Array = NDArray[np.float64]
 
@@ -92,8 +92,8 @@ def _near_distance(mesh: trimesh.Trimesh, volume: Volume, part: tuple[slice, ...
     k, j, i = np.nonzero(np.asarray(ndimage.distance_transform_edt(apart, volume.spacing[::-1])) < NEAR_MM)
     places = rigid.apply(volume.world_from_voxel, np.column_stack([i, j, k]) + low)
     neighbours = 6  # vertices that the distance to a surface is taken from
-    _, nearest = KDTree(mesh.vertices).query(places, k=neighbours, workers=numba.get_num_threads())
-    across = ((places[:, None] - mesh.vertices[nearest]) * mesh.vertex_normals[nearest]).sum(axis=2)
+    _, chosen = nearest(KDTree(mesh.vertices), places, neighbours)
+    across = ((places[:, None] - mesh.vertices[chosen]) * mesh.vertex_normals[chosen]).sum(axis=2)
     result = np.full(shape, np.nan)
     result[k, j, i] = across.mean(axis=1)
     return result

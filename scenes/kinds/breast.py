@@ -163,7 +163,7 @@ def albedo(config: Outside, skin: Dome, rng: np.random.Generator) -> NDArray[np.
 
 def check_depth(name: str, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> None:
     """Refuse a mass that has less than `least_mm` of tissue to the skin or the base, or lies outside; InputError."""
-    to_skin = _depth(mass.vertices, trimesh.Trimesh(skin.vertices, skin.faces, process=False)).min()
+    to_skin = depth(mass.vertices, trimesh.Trimesh(skin.vertices, skin.faces, process=False)).min()
     tissue = min(to_skin, mass.vertices[:, 2].min())
     if tissue < least_mm:
         raise InputError(f"{name}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
@@ -173,12 +173,12 @@ def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
     """Refuse tumour k if it comes nearer than `APART_MM` to an earlier one, or one lies within the other."""
     apart_mm = 1.0  # of tissue between two tumours
     for other in range(k):
-        gap = -max(_depth(masses[k].vertices, masses[other]).max(), _depth(masses[other].vertices, masses[k]).max())
+        gap = -max(depth(masses[k].vertices, masses[other]).max(), depth(masses[other].vertices, masses[k]).max())
         if gap < apart_mm:
             raise InputError(f"tumours.{k}: expected at least {apart_mm:g} mm from tumours.{other}, found {gap:.2f} mm")
 
 
-def _depth(points: Array, surface: trimesh.Trimesh) -> Array:
+def depth(points: Array, surface: trimesh.Trimesh) -> Array:
     """Distance of points : (n, 3) to a surface's nearest vertex : (n,) mm, positive on the inner side."""
     distance, nearest = surface_tree(surface.vertices).query(points)
     outwards = ((points - surface.vertices[nearest]) * surface.vertex_normals[nearest]).sum(axis=1) > 0

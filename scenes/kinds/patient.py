@@ -1,8 +1,10 @@
 """A patient on her back: a breast grown from a seed, on a chest with muscle, ribs and lung, and masses as radiologists say.
 
-Masses lie in what has grown as they are: touching, in clusters, in gland or fat. The skin is that of the breast phantom.
+Masses lie in what has grown as they are: touching, in clusters, in gland or fat, but none about another's middle. The skin is
+that of the breast phantom.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Annotated, Literal
 
@@ -10,12 +12,13 @@ import numpy as np
 import trimesh
 from pydantic import Field
 
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
-from scenes.kinds.breast import Outside, albedo, check_depth, closed, form_of, world_from_phantom
+from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, form_of, world_from_phantom
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
@@ -59,6 +62,14 @@ SPEEDS: dict[Pattern, float] = {
 """m/s: cysts 1530, carcinomas 1548 to 1570, fibroadenomas about 1530, lipomas as fat [Li et al. 2022]"""
 
 
+FORMS: tuple[MassForm, ...] = ("round", "oval", "lobulated", "irregular", "spiculated")
+"""of masses that are drawn"""
+COMMON: tuple[Pattern, ...] = ("anechoic", "hypoechoic", "hypoechoic", "hyperechoic")
+"""patterns of drawn ones with an even border, but for round ones, which are cysts; others are hypoechoic"""
+BEHIND_DARK: tuple[Behind, ...] = ("none", "shadow")
+"""what lies behind drawn hypoechoic ones"""
+
+
 class Mass(Part):
     """One mass, by the words of BI-RADS."""
 
@@ -100,11 +111,12 @@ class Config(Outside):
     nipple_height_mm: Positive = 5.0
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
     anatomy: Anatomy = Anatomy()
-    masses: tuple[Mass, ...] = (
+    masses: tuple[Mass, ...] | Literal["drawn"] = (
         Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
         Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
         Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
     )
+    """each by hand, or `drawn`: two or three by the seed"""
     least_mm: Annotated[float, Field(ge=0, le=20)] = 2.0
     """of tissue between a mass and the skin or the chest"""
     chest_reflectance: Fraction = 0.45
@@ -116,10 +128,10 @@ def build(config: Config) -> Scene:
     Raises
     ------
     InputError
-        If a mass lies too near to the skin or to the chest, or outside.
+        If a mass lies too near to the skin or to the chest, or outside, or one has another's middle in it.
     """
-    shape_rng, colour_rng, mass_rng = np.random.default_rng(config.seed).spawn(3)
-    skin = dome(form_of(config), shape_rng)
+    skin, colour_rng = skin_of(config), _streams(config)[1]
+    masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2])) if config.masses == "drawn" else config.masses
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
     things = [
@@ -131,15 +143,81 @@ def build(config: Config) -> Scene:
         ),
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
-    for k, (wanted, rng) in enumerate(zip(config.masses, mass_rng.spawn(len(config.masses)), strict=True)):
-        lying = _flattened(mass(wanted.form, wanted.size_mm, rng), FLAT[wanted.form])
-        body = solid_meshes.moved(lying, rigid.transform(np.eye(3), wanted.centre_mm))
+    bodies: list[trimesh.Trimesh] = []
+    for k, (wanted, rng) in enumerate(zip(masses, _streams(config)[2].spawn(len(masses)), strict=True)):
+        body = _lying(wanted, rng)
         check_depth(f"masses.{k}", body, skin, config.least_mm)
+        bodies.append(body)
+        _check_middles(masses, bodies)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
-    return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world))
+    drawn = {"masses": [one.model_dump(mode="json") for one in masses]} if config.masses == "drawn" else None
+    return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world), drawn=drawn)
+
+
+def skin_of(config: Config) -> Dome:
+    """The skin that grows from its seed, in the breast's frame."""
+    return dome(form_of(config), _streams(config)[0])
+
+
+def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[Mass, ...]:
+    """Draw two or three masses of 8 to 20 mm, 3 mm apart, whose words go together.
+
+    Raises
+    ------
+    InputError
+        If no place is found for them.
+    """
+    masses: list[Mass] = []
+    wanted = int(rng.integers(2, 4))
+    for _ in range(200):
+        if len(masses) == wanted:
+            break
+        size, form = float(rng.uniform(8, 20)), FORMS[rng.integers(len(FORMS))]
+        centre = rng.uniform([-38, -26, 14], [38, 26, 38])
+        pattern: Pattern = "hypoechoic"
+        if form == "round":
+            pattern = "anechoic"
+        elif form in CIRCUMSCRIBED:
+            pattern = COMMON[rng.integers(len(COMMON))]
+        dark = BEHIND_DARK[rng.integers(len(BEHIND_DARK))]
+        behind: Behind = "enhancement" if pattern == "anechoic" else dark if pattern == "hypoechoic" else "none"
+        one = Mass(size_mm=size, centre_mm=tuple(centre.tolist()), form=form, pattern=pattern, behind=behind)
+        if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + 3 for other in masses):
+            continue
+        try:
+            number = len(masses)
+            check_depth(f"masses.{number}", _lying(one, _streams(config)[2].spawn(number + 1)[number]), skin, config.least_mm)
+        except InputError:  # too near to skin or chest
+            continue
+        masses.append(one)
+    if len(masses) < wanted:
+        raise InputError(f"masses: expected room for {wanted} drawn ones, found it for {len(masses)}; give them, or another seed")
+    return tuple(masses)
+
+
+def _streams(config: Config) -> list[np.random.Generator]:
+    """Random numbers of skin, colour and masses."""
+    return np.random.default_rng(config.seed).spawn(3)
+
+
+def _lying(wanted: Mass, rng: np.random.Generator) -> trimesh.Trimesh:
+    """A mass in its place, in the breast's frame."""
+    flat = _flattened(mass(wanted.form, wanted.size_mm, rng), FLAT[wanted.form])
+    return solid_meshes.moved(flat, rigid.transform(np.eye(3), wanted.centre_mm))
+
+
+def _check_middles(masses: Sequence[Mass], bodies: Sequence[trimesh.Trimesh]) -> None:
+    """Refuse the last of some masses if its middle lies in an earlier one, or one's in it: they may touch, but hide no other."""
+    last = len(bodies) - 1
+    for other in range(last):
+        pairs = ((masses[last], bodies[other]), (masses[other], bodies[last]))
+        inside_mm = max(depth(np.array([mass.centre_mm]), body)[0] for mass, body in pairs)
+        if inside_mm > 0:
+            expected = f"expected its middle outside of masses.{other}, and that one's outside of it"
+            raise InputError(f"masses.{last}: {expected}, found one {inside_mm:.1f} mm within")
 
 
 def _flattened(body: trimesh.Trimesh, height: float) -> trimesh.Trimesh:

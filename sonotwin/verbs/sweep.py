@@ -15,8 +15,9 @@ With `living=patient` she breathes, her heart beats, and soft tissue yields to t
 expiration, is that of the fringes. OUT/truth/sweep/living.npz says where chest and masses were at each image, and where the
 points that its pixels show rest. Elasticity takes a quarter of a minute to set up and 2 GB of memory, for each worker.
 
-With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds from `seed` on, each of another patient with masses
-as `scene.masses` has them. A run that was stopped goes on where it was; any engine gives the same bytes.
+With `count` there are as many sweeps, in OUT/000000 and so on, of the seeds from `seed` on, each of another patient: of
+`scene.seed` plus the sweep's seed, with masses drawn by it unless `scene.masses` are given; OUT/*/truth/scene.json has them. A
+run that was stopped goes on where it was, and one of other settings is refused; any engine gives the same bytes.
 
 With a rig that has further bodies, such as three_bodies, their poses are written, too, and needles and styluses are in the
 B-scans that they are led to. Poses are found where both cameras have the body's target in view: a line for each body says in how
@@ -37,6 +38,7 @@ many, and warns of none.
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
@@ -98,6 +100,7 @@ def run(config: Config) -> None:
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
     session.check()
+    console.print(f"scene       {config.scene.get('kind', 'of no kind')}, setting it up")
     with console.status("setting up the scene"):
         planned = plan_sweep(config)
         film = filming(planned, console) if config.filmed else None
@@ -123,9 +126,13 @@ def render_many(config: Config, console: Console) -> None:
     numbers = sweep_data.missing(config.out, settings, config.count)
     if len(numbers) < config.count:
         console.print(f"found       {config.count - len(numbers)} sweeps")
+    if numbers:
+        console.print(f"scene       {config.scene['kind']}, setting it up for each of {len(numbers)} sweeps")
     total = 0
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        made = sweep_data.make(config.out, settings, numbers, config.engine)
+    with (
+        Progress(console=console, transient=True, disable=not console.is_terminal) as progress,
+        closing(sweep_data.make(config.out, settings, numbers, config.engine)) as made,
+    ):
         for images in progress.track(made, total=len(numbers), description="rendering sweeps"):
             total += images
     console.print(f"render      {len(numbers)} sweeps, {total} B-scans, {perf_counter() - start:.1f} s")

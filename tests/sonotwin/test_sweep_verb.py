@@ -11,6 +11,7 @@ import pytest
 from recon.capture import sweep_tables
 from recon.capture.manifest import Device, read_manifest
 from recon.capture.sweep_part import read_sweep
+from recon.errors import InputError
 from recon.files import volumes
 from recon.geometry import rigid
 from recon.model.patterns import CentreLine, Fringes, Patterns
@@ -171,6 +172,20 @@ def test_nonsense_is_refused_by_name(arguments, complaint, tmp_path, capsys):
     message = capsys.readouterr().err
     assert complaint in message and message.count("\n") == 1 and message.startswith("sonotwin: ")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, ""), (3, " for each of 3 sweeps")])
+def test_what_is_set_up_is_said_before(tmp_path, monkeypatch, capsys, count, said):
+    """A patient grows for a quarter of a minute, and a window without a word seems to hang."""
+    lines = []
+
+    def plan(settings):
+        lines.append(capsys.readouterr().out)
+        raise InputError("enough")
+
+    monkeypatch.setattr(f"{'sonotwin.verbs.sweep' if count == 1 else 'twin.sweep_data'}.plan_sweep", plan)
+    assert main(["sweep", "scene=patient", f"count={count}", f"out={tmp_path / 'out'}"]) == 2
+    assert lines == [f"scene       patient, setting it up{said}\n"]
 
 
 def test_a_place_that_is_taken_is_refused(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Many sweeps: each of its own patient and hand, resumed, and of the same bytes on any engine."""
 
 import hashlib
+import re
 
 import pytest
 
@@ -28,18 +29,33 @@ def digest(folder):
 
 def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
     later = sweep_data.numbered(settings, 3)
-    assert (later.seed, later.scene["seed"]) == (7, 10)
+    assert (later.seed, later.scene["seed"]) == (7, 14), "of the seed 7 of scenes, and of 4 + 3"
     assert later.path == settings.path
     cut = sweep_data.numbered(settings.model_copy(update={"scene": {"kind": "sphere"}}), 3)
     assert cut.scene == {"kind": "sphere"}
 
 
+def test_patients_have_drawn_masses_unless_they_are_given(settings):
+    given = [{"size_mm": 9.0, "centre_mm": (0.0, 0.0, 20.0)}]
+    for masses, expected in (({}, "drawn"), ({"masses": given}, given), ({"masses": []}, [])):
+        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, **masses}})
+        scenes = [sweep_data.numbered(chosen, number).scene for number in range(2)]
+        assert [scene["seed"] for scene in scenes] == [24, 25] and [scene["masses"] for scene in scenes] == [expected] * 2
+
+
 def test_sweeps_that_are_there_are_kept(settings, tmp_path):
+    """None is made again, nor replaced by one of other settings."""
     assert sweep_data.missing(tmp_path, settings, 2) == [0, 1]
     assert list(sweep_data.make(tmp_path, settings, [0], Engine())) == [3]
     assert sweep_data.missing(tmp_path, settings, 2) == [1]
-    other = settings.model_copy(update={"seed": 5})
-    assert sweep_data.missing(tmp_path, other, 1) == [0]
+    for change, difference in (
+        ({"seed": 5}, "seed: expected 5 as in this run, found 4"),
+        ({"path": Hold(seconds=0.2)}, "path.seconds: expected 0.2 as in this run, found 0.1"),
+        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found None"),
+    ):
+        there = f"{tmp_path / '000000' / 'truth' / 'settings.json'}: {difference}, another sweep; choose another out"
+        with pytest.raises(InputError, match=rf"^{re.escape(there)}$"):
+            sweep_data.missing(tmp_path, settings.model_copy(update=change), 1)
 
 
 def test_foreign_files_are_not_replaced(settings, tmp_path):
@@ -48,6 +64,30 @@ def test_foreign_files_are_not_replaced(settings, tmp_path):
     (mine / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(InputError, match=r"notes\.txt"):
         sweep_data.missing(tmp_path, settings, 2)
+
+
+def test_what_workers_had_begun_goes_away_when_one_is_refused(settings, tmp_path, monkeypatch):
+    """They are ended with what they hold; what others have put there stays."""
+
+    def refused(engine, work, tasks):
+        yield 3
+        for number, (out, _, _) in enumerate(tasks):
+            for name in ("truth", "capture"):
+                (out / f"{number:06d}" / f".{name}.4194305.new").mkdir(parents=True)  # above the largest process number
+                (out / f"{number:06d}" / f".{name}.lock").write_text("")
+        raise InputError("refused")
+
+    monkeypatch.setattr(sweep_data, "results", refused)
+    (tmp_path / "shared" / "000001").mkdir(parents=True)
+    (tmp_path / "shared" / "000001" / "notes.txt").write_text("mine", encoding="utf-8")
+    for name in ("own", "shared"):
+        with pytest.raises(InputError, match="refused"):
+            list(sweep_data.make(tmp_path / name, settings, [0, 1], Engine()))
+    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == [
+        "shared",
+        "shared/000001",
+        "shared/000001/notes.txt",
+    ]
 
 
 @pytest.mark.slow

@@ -10,12 +10,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import trimesh
 
-from recon.errors import InputError
 from recon.files.metrics import Metrics
 from recon.segmentation import contact
 from recon.session import masses_step
-from scenes.catalogue import build_scene
-from scenes.kinds.patient import CIRCUMSCRIBED
+from scenes.catalogue import parse_scene
+from scenes.kinds.patient import draw_masses, skin_of
 from twin.evaluation import sweep_errors
 from twin.experiments.experiment_runs import Experiment, Settings
 from twin.filmed_sweep import SweepSettings, plan_sweep
@@ -34,8 +33,6 @@ TISSUE_M_S = 1500.0  # mean of fat and gland
 ELEMENT_MM = 5.0  # coarse ones: the truth is what is applied
 SEED = 500  # of the first patient
 DENSITIES = ("fatty", "scattered", "heterogeneous", "dense")
-FORMS = ("round", "oval", "lobulated", "irregular", "spiculated")
-PATTERNS = ("anechoic", "hypoechoic", "hypoechoic", "hyperechoic")
 
 
 def patient(seed: int) -> dict:
@@ -46,28 +43,10 @@ def patient(seed: int) -> dict:
     InputError
         If no place is found for them.
     """
-    rng = np.random.default_rng([seed, 48])
     scene = {"kind": "patient", "seed": SEED + seed, "edge_mm": 1.5, "anatomy": {"density": DENSITIES[seed % len(DENSITIES)]}}
-    masses: list[dict] = []
-    wanted = int(rng.integers(2, 4))
-    for _ in range(200):
-        if len(masses) == wanted:
-            break
-        size, form = float(rng.uniform(8, 20)), str(rng.choice(FORMS))
-        centre = rng.uniform([-38, -26, 14], [38, 26, 38])
-        pattern = "anechoic" if form == "round" else str(rng.choice(PATTERNS if form in CIRCUMSCRIBED else ("hypoechoic",)))
-        behind = {"anechoic": "enhancement", "hypoechoic": str(rng.choice(["none", "shadow"]))}.get(pattern, "none")
-        one = {"size_mm": size, "centre_mm": centre.tolist(), "form": form, "pattern": pattern, "behind": behind}
-        if any(np.linalg.norm(centre - other["centre_mm"]) < (size + other["size_mm"]) / 2 + 3 for other in masses):
-            continue
-        try:
-            build_scene(scene | {"masses": [*masses, one]})
-        except InputError:  # too near to skin or chest
-            continue
-        masses.append(one)
-    if len(masses) < wanted:
-        raise InputError(f"patient {seed}: expected room for {wanted} masses, found it for {len(masses)}")
-    return scene | {"masses": masses}
+    config = parse_scene(scene)[1]
+    masses = draw_masses(config, skin_of(config), np.random.default_rng([seed, 48]))
+    return scene | {"masses": [one.model_dump(mode="json") for one in masses]}
 
 
 def measure(settings: Settings, seed: int) -> Metrics:

@@ -230,6 +230,20 @@ def test_folders_appear_together_or_not_at_all(tmp_path):
     assert names(tmp_path) == ["capture", "truth"] and (tmp_path / "truth" / "mark").read_text() == "first"
 
 
+@pytest.mark.parametrize("error", [InputError, KeyboardInterrupt])
+def test_folders_made_for_those_that_failed_go_away(tmp_path, error):
+    """But not what stood there, nor what others have put beside them meanwhile."""
+    (tmp_path / "mine").mkdir()
+    for outer, inner in (("mine", "a"), ("new", "b"), ("shared", "c")):
+        places = dict.fromkeys((tmp_path / outer / inner / name for name in ("truth", "capture")), "mark")
+        with pytest.raises(error), atomic.new_folders(places):
+            if outer == "shared":
+                (tmp_path / outer / "notes.txt").write_text("another's")
+            raise error("refused")
+    assert names(tmp_path) == ["mine", "shared"]
+    assert names(tmp_path / "mine") == [] and names(tmp_path / "shared") == ["notes.txt"]
+
+
 @pytest.mark.parametrize("atomically", [True, False])
 @pytest.mark.parametrize("calls", range(6))
 def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomically):

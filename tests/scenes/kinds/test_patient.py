@@ -41,6 +41,35 @@ def test_a_mass_outside_is_refused(centre, found):
         built(masses=[patient.Mass(size_mm=10, centre_mm=centre)])
 
 
+@pytest.mark.parametrize(("sizes", "apart"), [((12, 12), 0.0), ((12, 6), 4.0), ((6, 12), 4.0)])
+def test_a_mass_about_anothers_middle_is_refused(sizes, apart):
+    """Whichever of the two holds the other's: truth and labels would have one mass for two."""
+    masses = [patient.Mass(size_mm=size, centre_mm=(apart * k, 0, 22), form="round") for k, size in enumerate(sizes)]
+    with pytest.raises(
+        InputError, match=r"^masses\.1: expected its middle outside of masses\.0, .* found one [0-9.]+ mm within$"
+    ):
+        built(masses=masses)
+
+
+def test_masses_may_touch():
+    """Round ones of 12 mm, 11 mm apart: a cluster."""
+    cluster = [patient.Mass(size_mm=12, centre_mm=(11 * k, 0, 22), form="round") for k in range(2)]
+    assert sum(thing.inside for thing in built(masses=cluster).things) == 2
+
+
+def test_drawn_masses_are_the_seeds_and_are_told():
+    """Other ones by another seed, and those that are told, given by hand, are the same bodies."""
+    first = built(masses="drawn", seed=8)
+    again = built(masses=first.drawn["masses"], seed=8)
+    pairs = zip(first.things, again.things, strict=True)
+    assert all((one.mesh.vertices == two.mesh.vertices).all() and one.tissue == two.tissue for one, two in pairs)
+    assert again.drawn is None and 2 <= len(first.drawn["masses"]) <= 3
+    config = patient.Config(**COARSE, seed=9)
+    others = patient.draw_masses(config, patient.skin_of(config), np.random.default_rng([9, 2]))
+    assert all(8 <= one.size_mm <= 20 for one in others)
+    assert not {one.centre_mm[0] for one in others} & {one["centre_mm"][0] for one in first.drawn["masses"]}
+
+
 def test_layers_lie_in_the_world_and_are_the_same_each_time():
     scene = built(masses=[])
     first, second = scene.layers(), scene.layers()
