@@ -3,7 +3,6 @@
 Poses have the noise of `PoseNoise`; probe, lag and the mean speed of sound are known. The skin is that of her rest.
 """
 
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,10 +26,9 @@ from twin.ultrasound.timed_sweep import Clocks
 PATH = SurfacePath(
     start_mm=(-22.0, -31.0), end_mm=(-22.0, 36.0), strokes=2, stroke_step_mm=44.0, speed_mm_s=15.0, standoff_mm=-2.0
 )
-LIVING = Living(yields=True, breathing_mm=2.0, breathing_deg=0.3, heartbeat_mm=0.2, drag_mm=1.0)
+LIVING = Living(yields=True, breathing_mm=2.0, breathing_deg=0.3, heartbeat_mm=0.2, drag_mm=1.0, element_mm=5.0)
 CLOCKS = Clocks(scanner_hz=15.0)  # a B-scan a millimetre
 TISSUE_M_S = 1500.0  # mean of fat and gland
-ELEMENT_MM = 5.0  # coarse ones: the truth is what is applied
 SEED = 500  # of the first patient
 DENSITIES = ("fatty", "scattered", "heterogeneous", "dense")
 
@@ -61,9 +59,6 @@ def measure(settings: Settings, seed: int) -> Metrics:
         seed=seed,
     )
     planned = plan_sweep(chosen)
-    assert planned.living is not None
-    coarse = replace(planned.living.patient, element_mm=ELEMENT_MM)
-    planned = replace(planned, living=replace(planned.living, patient=coarse))
     skin = next(thing.mesh for thing in planned.scene.things if thing.name == "breast")
     hidden = [thing for thing in planned.scene.things if thing.inside]
     with TemporaryDirectory() as folder:

@@ -33,7 +33,6 @@ from twin.ultrasound.probe_path import top
 Array = NDArray[np.float64]
 Tile = tuple[int, int]  # of the skin, along x and y
 
-ELEMENT_MM = 3.0  # along x and y: displacements under a probe are then within 2 % of those of 2.5 mm
 TILE = 4  # nodes of the skin along x and y whose responses are worked out at once
 KEPT = 32  # tiles whose responses are kept, of 20 MB each by default; a face lies on up to 18
 LAYERS = (0.04, 0.06, 0.08, 0.11, 0.15, 0.18, 0.19, 0.19)  # heights of a column's elements over its own, from the skin
@@ -175,7 +174,7 @@ class ElasticBody:
         return every
 
 
-def elastic_body(body: Body, surface: Solid, support: Solid | None, element_mm: float = ELEMENT_MM) -> ElasticBody:
+def elastic_body(body: Body, surface: Solid, support: Solid | None, element_mm: float) -> ElasticBody:
     """Mesh a solid that faces the cameras, with all that lies in it, and factorise its stiffness; takes some seconds.
 
     support : on which it lies; where that is soft, the body is held HELD_MM below its surface

@@ -60,7 +60,7 @@ def _patients(scanner: Path) -> dict[str, NDArray[np.uint8]]:
     array, images = Transducer(**yaml.safe_load(scanner.read_text(encoding="utf-8"))), {}
     for seed, density in enumerate(GLANDULAR):
         breast = body(build_scene({"kind": "patient", "seed": 7 + seed, "anatomy": {"density": density}}))
-        patient = LivingBody(Living(yields=True), breast, surface_of("breast", breast), (0.0, 0.0), element_mm=5.0)
+        patient = LivingBody(Living(yields=True, element_mm=5.0), breast, surface_of("breast", breast), (0.0, 0.0))
         for title, (x, y) in PATIENTS[density].items():
             held = resting(Hold(place_mm=(x, y), hand=STILL, standoff_mm=-4.0), patient.surface, array, 1)
             field = LivingSweep(patient, array, held).field(0, held.poses[0])

@@ -32,7 +32,7 @@ def foot(depth_mm, half=(20.0, 6.0), radius=15.0):
 @pytest.fixture(scope="module")
 def soft():
     there = block()
-    return elastic_body.elastic_body(there, there.solids[0], None)
+    return elastic_body.elastic_body(there, there.solids[0], None, 3.0)
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_a_body_goes_along_with_its_base(soft):
 
 
 def test_responses_have_the_same_bits_in_any_order(soft):
-    other = elastic_body.elastic_body(block(), block().solids[0], None)
+    other = elastic_body.elastic_body(block(), block().solids[0], None, 3.0)
     nodes = np.array([5 * soft.size[1] + 7, 9 * soft.size[1] + 3])
     here, there = soft.respond(nodes), other.respond(nodes[::-1])
     assert all((here[node] == there[node]).all() for node in nodes.tolist())

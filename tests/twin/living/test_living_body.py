@@ -250,13 +250,12 @@ def test_truth_says_where_points_rest_and_are(pressed_sweep):
 @pytest.mark.slow
 def test_each_field_is_worked_out_once(rig, monkeypatch):
     """Truth of images that were taken is that of none taken yet."""
-    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0)
+    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0, element_mm=8.0)
     planned = plan_sweep(settings(rig, living=living, clocks={"scanner_hz": 4.0}))
-    coarse = replace(planned.living, patient=replace(planned.living.patient, element_mm=8.0))
-    expected = replace(planned, living=coarse).truth()
+    expected = planned.truth()
     pressed, press = [], elastic_body.press
     monkeypatch.setattr(elastic_body, "press", lambda *given: pressed.append(1) or press(*given))
-    taken = replace(planned, living=replace(coarse))
+    taken = replace(planned, living=replace(planned.living))
     assert len(list(taken.scans())) > 2
     found = taken.truth()
     assert len(pressed) == len(planned.plan.truth.times)
@@ -305,14 +304,14 @@ def test_hard_supports_stay(phantom):
 @pytest.mark.parametrize("y", [-45.0, -35.0, 0.0, 45.0])
 def test_a_foot_is_as_deep_in_a_slope_as_it_was_led(phantom, array, y):
     """Down to slopes of 50 degrees, to what is rounded off the foot and lost between elements."""
-    patient = LivingBody(Living(yields=True), phantom, surface_of("breast", phantom), (0.0, 0.0), 4.0)
+    patient = LivingBody(Living(yields=True, element_mm=4.0), phantom, surface_of("breast", phantom), (0.0, 0.0))
     face, normal = living_body_module._foot(array, over(phantom, array, (4.0, y), standoff_mm=-2.0))
     depth = elastic_body._under(patient.soft, face, normal).depth
     assert 1.0 < depth.max() < 2.5
 
 
 def test_a_light_touch_draws_little_skin_along(phantom, array):
-    patient = LivingBody(Living(yields=True), phantom, surface_of("breast", phantom), (0.0, 0.0), 5.0)
+    patient = LivingBody(Living(yields=True, element_mm=5.0), phantom, surface_of("breast", phantom), (0.0, 0.0))
     face, normal = living_body_module._foot(array, over(phantom, array, standoff_mm=-0.1))
     across = np.cross(normal, [1.0, 0.0, 0.0])
     drawn = elastic_body.press(patient.soft, face, normal, drag=5.0 * across)
