@@ -78,6 +78,7 @@ class Run:
         return json.loads(self.ask("state")[1])
 
     def end(self):
+        until(lambda: "\nlight " in self.said or not self._thread.is_alive())  # else it might begin to count after the end
         self.ended.set()
         self._thread.join(PATIENCE_S)
         return self.status
