@@ -57,11 +57,21 @@ class CutBodyLimits:
     least_mm: float = 2.5  # of it down the beam; speckle has no holes as deep
     darkest: float = 0.1  # share that is as dark as a mass's core: of a small piece most lies within the blur of its border
     same: float = 0.5  # share of it that is whole by itself
-    mostly: float = 0.6  # share of what lies before it that shows tissue: elsewhere the probe doesn't touch
+    mostly: float = 0.6  # share of what was seen before it that shows tissue: elsewhere the probe doesn't touch
+    before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
-LIMITS, CUT = MassLimits(), CutBodyLimits()
+@dataclass(frozen=True)
+class GapLimits:
+    """When what no B-scan shows, with B-scans on both sides, is named as a gap."""
+
+    widths_mm: tuple[float, float] = (2.0, 20.0)  # least, as masses of 5 mm are cut by it, and most: beyond are strokes apart
+    least_mm3: float = 100.0
+    named: int = 3  # at most, the largest
+
+
+LIMITS, CUT, GAP = MassLimits(), CutBodyLimits(), GapLimits()
 
 
 def from_scans(
@@ -225,7 +235,7 @@ def rough(power: EchoPower) -> list[Mass]:
             continue
         whole[part] |= inside
         candidates.append((part, inside, volume, core))
-    shadowed = _name_cut_bodies(dark, whole, ratio, seen, power)
+    shadowed = _name_cut_bodies(dark, whole, ratio, seen, _name_gaps(power), power)
     result = []
     for part, inside, volume, core in candidates:
         height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
@@ -259,15 +269,39 @@ def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
     return tuple(np.asarray(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True)))
 
 
-def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power: EchoPower) -> Mask:
-    """Log a line of each dark body, with tissue before it, that a side or an end of the scan cuts: voxels in their shadows.
+def _name_gaps(power: EchoPower) -> Mask:
+    """Log the largest gaps that no B-scan shows, with B-scans on both sides, where masses would be missed: voxels in all gaps."""
+    spacing, gaps, found = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool), []
+    for axis, where in ((0, "in the sweep"), (2, "between strokes")):
+        number = np.arange(power.weight.shape[axis], dtype=np.float32).reshape(np.where(np.arange(3) == axis, -1, 1))
+        before = np.maximum.accumulate(np.where(power.seen, number, -np.inf), axis)
+        behind = np.flip(np.minimum.accumulate(np.flip(np.where(power.seen, number, np.inf), axis), axis), axis)
+        width = np.where(gaps, 0, (behind - before - 1) * spacing[axis])
+        within = (width >= GAP.widths_mm[0]) & (width <= GAP.widths_mm[1])
+        labels, _ = ndimage.label(within)
+        for one, part in enumerate(ndimage.find_objects(labels), start=1):
+            inside = labels[part] == one
+            if (volume := inside.sum() * float(np.prod(spacing))) >= GAP.least_mm3:
+                found.append((volume, float(np.median(width[part][inside])), where, _middle(inside, part, power)))
+        gaps |= within
+    found.sort(key=lambda gap: -gap[0])
+    for volume, wide, where, middle in found[: GAP.named]:
+        told = "a gap of %.1f mm %s, %.0f mm3 about %.0f, %.0f, %.0f mm, wasn't scanned: masses in it aren't found"
+        log.warning(told, wide, where, volume, *middle)
+    if others := found[GAP.named :]:
+        log.warning("%d smaller gaps, %.0f mm3 together, weren't scanned", len(others), sum(gap[0] for gap in others))
+    return gaps
+
+
+def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, power: EchoPower) -> Mask:
+    """Log a line of each dark body behind tissue that a side, an end or a gap of the scan cuts: voxels in their shadows.
 
     Bodies that are whole are left out. The dark behind a phantom has a line of its own: nothing bright is behind it, and it has
     hardly a side.
     """
     spacing = power.volume.spacing[::-1]
     pad = int(np.ceil(2 * LIMITS.open_mm / spacing.min()))
-    whole, known = np.pad(whole, pad), np.pad(seen, pad)
+    whole, known, gap = np.pad(whole, pad), np.pad(seen, pad), np.pad(gap, pad)
     ratio = np.pad(ratio, pad, constant_values=1.0)
     dark = np.pad(dark, pad)
     bright = known & (ratio > LIMITS.dark)
@@ -286,13 +320,16 @@ def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, power:
             continue
         shell, behind = _widen(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
         before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
-        beside, before = shell & ~behind & ~before, shell & before
+        beside, before = shell & ~behind & ~before, shell & before & inside.any(axis=1, keepdims=True)
+        unseen, front = shell & ~here, before & here
         sides = {
-            ("the images' side", "scan on there"): _fullest(shell & ~here, 2),
-            ("the sweep's end", "scan on there"): _fullest(shell & ~here, 0),
-            ("the images' lower end", "set a greater depth"): _fullest(shell & ~here, 1),
+            ("the images' side", "scan on there"): _fullest(unseen, 2),
+            ("the sweep's end", "scan on there"): _fullest(unseen & ~gap[part], 0),
+            ("a gap in the sweep", "scan there again"): _fullest(unseen & gap[part], 0),
+            ("the images' lower end", "set a greater depth"): _fullest(unseen, 1),
         }
-        if not any(sides.values()) or (before & bright[part]).sum() < CUT.mostly * before.sum():
+        covered = front.sum() > CUT.before * before.sum() and (front & bright[part]).sum() >= CUT.mostly * front.sum()
+        if not any(sides.values()) or not covered:
             continue
         ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
         middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)

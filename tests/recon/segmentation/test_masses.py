@@ -133,6 +133,27 @@ def test_a_body_of_which_any_part_is_seen_is_named_with_what_cuts_it(axis, borde
     assert extents[2 - axis] == pytest.approx(2 * share * RADIUS, abs=1) and min(extents[1], extents[axis]) > 6
 
 
+def with_gap(power, first, width_mm):
+    """The same without what lies in a slab across the sweep."""
+    lost = slice(first, first + round(width_mm / SPACING[2]))
+    power.volume.voxels[lost], power.weight[lost] = 0, 0
+    return power
+
+
+@pytest.mark.parametrize("width_mm", [4.0, 7.0])
+def test_a_body_that_a_gap_in_the_sweep_cuts_is_named_and_so_is_the_gap(width_mm, rng, caplog):
+    """The ball of 10 mm is lost in part, and is no mass; with the gap beside it, it is one."""
+    middle = int(CENTRE[2] - ORIGIN[2]) * 2
+    assert not find(with_gap(speckled(ball()[0], rng), middle - round(width_mm), width_mm))
+    gap, *bodies = caplog.messages
+    found = re.fullmatch(r"a gap of (\S+) mm in the sweep, (\d+) mm3 about 3, 70\d, 1[345] mm, wasn't scanned: .*", gap)
+    assert float(found[1]) == width_mm and float(found[2]) == pytest.approx(36 * 36 * width_mm, rel=0.1)
+    assert bodies and all("is cut by a gap in the sweep" in one for one in bodies)
+    caplog.clear()
+    assert len(find(with_gap(speckled(ball()[0], rng), 0, 0.5))) == 1 and not caplog.messages
+    assert len(find(with_gap(speckled(ball()[0], rng), 4, 3.0))) == 1 and len(caplog.messages) == 1
+
+
 @pytest.mark.parametrize("share", [0.35, 0.8])
 def test_a_body_that_the_images_lower_end_cuts_asks_for_depth(share, rng, caplog):
     last = int(((CENTRE - ORIGIN)[1] + (2 * share - 1) * RADIUS) / SPACING[1])
