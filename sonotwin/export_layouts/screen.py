@@ -1,5 +1,6 @@
 """A scanner's own recording: whole screens with the B-scan in its place, and a tracker's table, as `import-sweep` reads them."""
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal
@@ -20,7 +21,9 @@ from recon.clips.pose_tables import Columns
 from recon.errors import InputError
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+from sonotwin import command_line
 from sonotwin.export_layouts import Settings
+from sonotwin.verbs import import_sweep
 
 Grey = NDArray[np.uint8]
 Times = NDArray[np.int64]
@@ -29,7 +32,6 @@ TAKES = ("capture", "sweep", "implausible", "probe", "screen_px")
 ABOUT = "of a sweep's B-scans and poses alone"
 SCREENS, POSES = "screen", "poses.csv"
 COLUMNS = Columns(time="time", translation=("x", "y", "z"), quaternion=("qx", "qy", "qz", "qw"))  # s, mm
-COLUMNS_FIELD = "columns='{time: time, translation: [x,y,z], quaternion: [qx,qy,qz,qw]}'"
 BRIGHT, FAINT, HEADER = 190, 95, 26  # grey levels
 
 
@@ -72,20 +74,25 @@ def write(folder: Path, settings: Settings) -> list[str]:
     for number, screen in enumerate(screens(sweep, still, box)):
         write_images([folder / SCREENS / image_name(number)], screen[None])
     write_poses(folder / POSES, sweep.track)
-    crop = f"crop=[{','.join(map(str, box))}]"
     alone = _found(screens(sweep, still, box)) == box
-    fields = [f"clip={settings.out / SCREENS}", f"poses={settings.out / POSES}", COLUMNS_FIELD]
-    fields += [f"starts_s={starts_s:.9f}", f"rate_hz={rate_hz:.12g}"]
-    fields += [] if alone else [crop]
-    fields += [f"purpose={part.purpose}"] if part.purpose else []
-    fields += ["implausible=take"] if settings.implausible == "take" else []
+    reading = import_sweep.Config(
+        clip=settings.out / SCREENS,
+        poses=settings.out / POSES,
+        columns=COLUMNS,
+        starts_s=starts_s,
+        rate_hz=rate_hz,
+        crop="auto" if alone else box,
+        purpose=part.purpose or "volume",
+        implausible=settings.implausible,
+        out=Path("FOLDER"),
+    )
     width, height = settings.screen_px
     finds = "which import-sweep finds by itself" if alone else "to be given, as they don't change out to their edges"
     return [
-        f"screen      {len(sweep.paths)} images of {width}x{height}, B-scans at {crop}, {finds}",
+        f"screen      {len(sweep.paths)} images of {width}x{height}, B-scans at crop=[{','.join(map(str, box))}], {finds}",
         f"poses       {found.sum()} of {len(found)} rows; {placed.sum()} of {len(placed)} B-scans have one",
         f"clock       {rate_hz:.4g} B-scans a second, which are {1e3 * off_s:.2g} ms off their time stamps at most",
-        f"read        sonotwin import-sweep {' '.join(fields)} out=FOLDER",
+        f"read        {shlex.join(['sonotwin', *command_line.words('import-sweep', reading)])}",
     ]
 
 

@@ -69,8 +69,9 @@ def screens(folder: Path) -> np.ndarray:
 
 def read_back(said: str, out: Path) -> sweep_part.SweepCapture:
     """Run the command that is printed."""
-    (line,) = re.findall(r"^read +(sonotwin .*) out=FOLDER$", said, re.MULTILINE)
-    assert main([*shlex.split(line)[1:], f"out={out}"]) == 0
+    (line,) = re.findall(r"^read +(sonotwin .*)$", said, re.MULTILINE)
+    fields = [word for word in shlex.split(line)[1:] if word != "out=FOLDER"]
+    assert main([*fields, f"out={out}"]) == 0
     return sweep_part.read_sweep(out)
 
 

@@ -473,7 +473,8 @@ def test_another_dialect_of_calibrations_is_one_module(optics, tmp_path, monkeyp
     writer.write_surface(capture, {"cam1": photograph(patterns, optics)}, patterns, optics, devices)
     export = ["export", "layout=rows", f"capture={capture}", f"out={tmp_path / 'theirs'}"]
     assert main(export) == 2
-    assert "'meza2021', 'us_calibration', 'kalibr', 'mrcal', 'ros' or 'slstudio', found 'rows'" in capsys.readouterr().err
+    names = "'meza2021', 'screen', 'us_calibration', 'kalibr', 'mrcal', 'ros' or 'slstudio'"
+    assert f"{names}, found 'rows'" in capsys.readouterr().err
     added.add(monkeypatch, tmp_path / "ours", calibration_files.DIALECTS, "rows", ROWS)
     assert main(export) == 0
     theirs = tmp_path / "theirs" / "rig.rows"
