@@ -66,8 +66,9 @@ class CutBodyLimits:
 class GapLimits:
     """When what no B-scan shows, with B-scans on both sides, is named as a gap."""
 
-    widths_mm: tuple[float, float] = (2.0, 20.0)  # least, as masses of 5 mm are cut by it, and most: beyond are strokes apart
-    least_mm3: float = 100.0
+    widths_mm: tuple[float, float] = (3.5, 20.0)  # least, from which masses are cut in two, and most: beyond are strokes apart
+    height_mm: float = 6.0  # down the beam, at least: a hand that goes up and down leaves less at the images' lower end
+    least_mm3: float = 500.0  # lost B-scans leave thousands; turned planes leave less beside each other
     named: int = 3  # at most, the largest
 
 
@@ -202,7 +203,7 @@ def rough(power: EchoPower) -> list[Mass]:
     Warnings are logged of bodies that the scan's side or end cuts, of those behind them, and of streaks down the beam, which may
     be shadows of borders.
     """
-    spacing = power.volume.spacing[::-1]
+    spacing, gaps = power.volume.spacing[::-1], _name_gaps(power)
     smooth = _smooth(power.volume.voxels, power.weight, LIMITS.smooth_mm / spacing)
     seen = np.isfinite(smooth)
     tissue = np.minimum(power.volume.voxels, 2.0)
@@ -235,7 +236,7 @@ def rough(power: EchoPower) -> list[Mass]:
             continue
         whole[part] |= inside
         candidates.append((part, inside, volume, core))
-    shadowed = _name_cut_bodies(dark, whole, ratio, seen, _name_gaps(power), power)
+    shadowed = _name_cut_bodies(dark, whole, ratio, seen, gaps, power)
     result = []
     for part, inside, volume, core in candidates:
         height, thick = np.ptp(np.nonzero(inside)[1]) * spacing[1], _thickness(inside, spacing)
@@ -270,27 +271,37 @@ def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
 
 
 def _name_gaps(power: EchoPower) -> Mask:
-    """Log the largest gaps that no B-scan shows, with B-scans on both sides, where masses would be missed: voxels in all gaps."""
+    """Log the largest gaps that no B-scan shows, with B-scans on both sides, where masses are missed: voxels in any gap."""
     spacing, gaps, found = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool), []
+    tall = np.ones((1, int(np.ceil(GAP.height_mm / spacing[1])), 1), bool)
     for axis, where in ((0, "in the sweep"), (2, "between strokes")):
-        number = np.arange(power.weight.shape[axis], dtype=np.float32).reshape(np.where(np.arange(3) == axis, -1, 1))
-        before = np.maximum.accumulate(np.where(power.seen, number, -np.inf), axis)
-        behind = np.flip(np.minimum.accumulate(np.flip(np.where(power.seen, number, np.inf), axis), axis), axis)
-        width = np.where(gaps, 0, (behind - before - 1) * spacing[axis])
-        within = (width >= GAP.widths_mm[0]) & (width <= GAP.widths_mm[1])
-        labels, _ = ndimage.label(within)
+        width = _gap_widths(power.seen, axis, float(spacing[axis]))
+        width[gaps | (width > GAP.widths_mm[1])] = 0
+        gaps |= width > 0
+        labels, _ = ndimage.label(ndimage.binary_opening(width >= GAP.widths_mm[0], tall))
         for one, part in enumerate(ndimage.find_objects(labels), start=1):
             inside = labels[part] == one
             if (volume := inside.sum() * float(np.prod(spacing))) >= GAP.least_mm3:
                 found.append((volume, float(np.median(width[part][inside])), where, _middle(inside, part, power)))
-        gaps |= within
     found.sort(key=lambda gap: -gap[0])
     for volume, wide, where, middle in found[: GAP.named]:
-        told = "a gap of %.1f mm %s, %.0f mm3 about %.0f, %.0f, %.0f mm, wasn't scanned: masses in it aren't found"
+        told = "a gap of %.1f mm %s, %.0f mm3 about %.0f, %.0f, %.0f mm, wasn't scanned: masses in it may be missed"
         log.warning(told, wide, where, volume, *middle)
     if others := found[GAP.named :]:
         log.warning("%d smaller gaps, %.0f mm3 together, weren't scanned", len(others), sum(gap[0] for gap in others))
     return gaps
+
+
+def _gap_widths(seen: Mask, axis: int, step_mm: float) -> Map:
+    """Width, mm, along an axis of the run of unseen voxels that each is in; infinite at an end of the volume, 0 of seen ones."""
+    number = np.arange(seen.shape[axis], dtype=np.float32).reshape(np.where(np.arange(3) == axis, -1, 1))
+    width = np.where(seen, number, np.float32(np.inf))
+    width = np.flip(np.minimum.accumulate(np.flip(width, axis), axis), axis)  # the next that is seen
+    width -= np.maximum.accumulate(np.where(seen, number, np.float32(-np.inf)), axis)
+    width -= np.float32(1)
+    width *= np.float32(step_mm)
+    width[seen] = 0
+    return width
 
 
 def _name_cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, power: EchoPower) -> Mask:

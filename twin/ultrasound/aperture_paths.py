@@ -75,8 +75,8 @@ def _tangents(transducer: Transducer) -> Array:
 def _weights(transducer: Transducer, depths: Array) -> Array:
     """Hann's weights : (2, rays, levels) of the rays in the apertures that send and receive."""
     half = np.stack([sent_aperture(transducer, depths), receive_aperture(transducer, depths)]) / 2
-    aside = np.abs(_tangents(transducer))[:, None] * depths
-    return np.cos(np.pi / 2 * np.minimum(aside / half[:, None], 1)) ** 2
+    share = np.abs(_tangents(transducer))[:, None] * depths / half[:, None]
+    return np.where(share < 1, np.cos(np.pi / 2 * share) ** 2, 0)
 
 
 def _mean(table: Array, half: NDArray[np.int64]) -> Array:

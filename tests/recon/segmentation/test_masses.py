@@ -133,25 +133,46 @@ def test_a_body_of_which_any_part_is_seen_is_named_with_what_cuts_it(axis, borde
     assert extents[2 - axis] == pytest.approx(2 * share * RADIUS, abs=1) and min(extents[1], extents[axis]) > 6
 
 
-def with_gap(power, first, width_mm):
-    """The same without what lies in a slab across the sweep."""
-    lost = slice(first, first + round(width_mm / SPACING[2]))
-    power.volume.voxels[lost], power.weight[lost] = 0, 0
+def with_gap(power, first, width_mm, axis=0):
+    """The same without what lies in a slab across the sweep, or along it between two strokes."""
+    lost = [slice(None)] * 3
+    lost[axis] = slice(first, first + round(width_mm / SPACING[::-1][axis]))
+    power.volume.voxels[tuple(lost)], power.weight[tuple(lost)] = 0, 0
     return power
 
 
+@pytest.mark.parametrize(("axis", "where"), [(0, "in the sweep"), (2, "between strokes")])
 @pytest.mark.parametrize("width_mm", [4.0, 7.0])
-def test_a_body_that_a_gap_in_the_sweep_cuts_is_named_and_so_is_the_gap(width_mm, rng, caplog):
-    """The ball of 10 mm is lost in part, and is no mass; with the gap beside it, it is one."""
-    middle = int(CENTRE[2] - ORIGIN[2]) * 2
-    assert not find(with_gap(speckled(ball()[0], rng), middle - round(width_mm), width_mm))
+def test_a_body_that_a_gap_cuts_is_named_and_so_is_the_gap(axis, where, width_mm, rng, caplog):
+    """The ball of 10 mm is lost in part, and is no mass."""
+    middle = int((CENTRE - ORIGIN)[::-1][axis] / SPACING[::-1][axis])
+    assert not find(with_gap(speckled(ball()[0], rng), middle - round(width_mm), width_mm, axis))
     gap, *bodies = caplog.messages
-    found = re.fullmatch(r"a gap of (\S+) mm in the sweep, (\d+) mm3 about 3, 70\d, 1[345] mm, wasn't scanned: .*", gap)
-    assert float(found[1]) == width_mm and float(found[2]) == pytest.approx(36 * 36 * width_mm, rel=0.1)
-    assert bodies and all("is cut by a gap in the sweep" in one for one in bodies)
-    caplog.clear()
-    assert len(find(with_gap(speckled(ball()[0], rng), 0, 0.5))) == 1 and not caplog.messages
-    assert len(find(with_gap(speckled(ball()[0], rng), 4, 3.0))) == 1 and len(caplog.messages) == 1
+    found = re.fullmatch(rf"a gap of (\S+) mm {where}, (\d+) mm3 about \d, 70\d, 1\d mm, wasn't scanned: .*", gap)
+    across = 36 * (36 if axis == 0 else 32)
+    assert float(found[1]) == width_mm and float(found[2]) == pytest.approx(across * width_mm, rel=0.1)
+    cut = "a gap in the sweep" if axis == 0 else "the images' side"
+    assert bodies and all(f"is cut by {cut}" in one for one in bodies)
+
+
+def test_a_gap_that_hides_no_mass_of_some_size_is_bridged_or_a_line_of_its_own(rng, caplog):
+    """A mass is found over 2 and 3 mm, and beside 5 mm."""
+    middle = int((CENTRE[2] - ORIGIN[2]) / SPACING[2])
+    for width_mm in (2.0, 3.0):
+        (mass,) = find(with_gap(speckled(ball()[0], rng), middle - round(width_mm), width_mm))
+        assert mass.volume == pytest.approx(VOLUME, rel=0.06) and not caplog.messages
+    assert len(find(with_gap(speckled(ball()[0], rng), 3, 5.0))) == 1
+    (told,) = caplog.messages
+    assert told.startswith("a gap of 5.0 mm in the sweep")
+
+
+def test_a_hand_that_goes_up_and_down_leaves_no_gap(rng, caplog):
+    """By 2 mm, as in breathing: images end now higher, now deeper."""
+    power = speckled(ball()[0], rng)
+    for k, mm in enumerate(2 - 2 * np.cos(4 * np.pi * np.arange(SIZE[2]) / SIZE[2])):
+        rows = round(mm / SPACING[1])
+        power.weight[k, -1 - rows :], power.weight[k, : round((4 - mm) / SPACING[1])] = 0, 0
+    assert len(find(power)) == 1 and not caplog.messages
 
 
 @pytest.mark.parametrize("share", [0.35, 0.8])
