@@ -25,6 +25,7 @@ class RingingLimits:
     as_bright: float = 0.8  # of the brightest row, from which on a row may be the face: a compressed one is a little darker
     across: float = 0.9  # share of the width that is above half of a row's level
     height: float = 0.05  # of what changes, at most: ringing is 0.2 to 1 mm of 30 mm and more
+    ends: float = 0.05  # of the width, at most, on either side, at which an array has no contact throughout
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
@@ -51,21 +52,29 @@ def find_below_ringing(frames: Iterable[NDArray[np.uint8]], name: str, field: st
 def _with_ringing(mean: NDArray[np.float32], part: Box, limits: RingingLimits) -> Box:
     """The part with the face's ringing: rows right above it that are bright across its width, and dark beside it, in the mean.
 
-    The face is the topmost row about as bright as the brightest; what stands above it is a title.
+    The face is the topmost row about as bright as the brightest; what stands above it is a title. An end of the array that has no
+    contact rings, too, though nothing changes below it: the part gets as wide as the face's row.
     """
     u, v, width, height = part
-    levels = []
+    most_px, levels, sides = limits.ends * width, [], []
     for row in mean[:v][::-1]:
         level = float(np.median(row[u : u + width]))
         lit = row > level / 2
-        beside = np.append(lit[max(u - 1, 0) : u], lit[u + width : u + width + 1])
-        if level < limits.dark_dn or lit[u : u + width].mean() < limits.across or len(beside) < 2 or beside.any():
+        left, right = np.flatnonzero(~lit[:u]), np.flatnonzero(~lit[u + width :])
+        if level < limits.dark_dn or lit[u : u + width].mean() < limits.across or not left.size or not right.size:
+            break
+        wider = u - 1 - int(left[-1]), int(right[0])
+        if max(wider) > most_px:
             break
         levels.append(level)
+        sides.append(wider)
     if max(levels, default=0.0) < limits.face_dn:
         return part
     rows = 1 + int(np.flatnonzero(np.array(levels) > limits.as_bright * max(levels))[-1])
-    return part if rows > limits.height * height else (u, v - rows, width, height + rows)
+    (left, right), level = sides[rows - 1], levels[rows - 1]
+    ends = mean[v : v + height, u - left : u], mean[v : v + height, u + width : u + width + right]
+    framed = any(still.size and np.median(still) > level / 2 for still in ends)
+    return part if framed or rows > limits.height * height else (u - left, v - rows, left + width + right, height + rows)
 
 
 def _whole_or(part: Box, shape: tuple[int, ...]) -> Box:

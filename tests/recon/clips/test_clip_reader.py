@@ -266,7 +266,7 @@ def test_the_b_scan_is_what_changes_on_the_screen(moved):
     ((255,), True),
 ])  # fmt: skip
 def test_the_ringing_of_the_face_belongs_to_the_b_scan(above, belongs):
-    """It is as wide as the B-scan; what is wider is a frame or a header, and a bright background is on all sides."""
+    """It is about as wide as the B-scan; what is wider is a frame or a header, and a bright background is on all sides."""
     u, v, width, height = BOX
     plain = np.zeros((12, *made_clips.SCREEN[::-1]), np.uint8)
     plain[:, v : v + height, u : u + width] = made_clips.scans(12)
@@ -303,6 +303,28 @@ def test_a_title_as_wide_as_the_b_scan_is_no_ringing(above, rings):
     """Ringing is brightest at the face, and takes up a little of the depth."""
     u, v, width, height = BOX
     assert image_region.find(panel(*above), "screen", "crop=...") == (u, v - rings, width, height + rings)
+
+
+@pytest.mark.parametrize(("left", "right"), [(1, 0), (2, 2), (0, 5), (5, 5)])
+def test_ends_of_the_array_without_contact_belong_to_the_b_scan(left, right):
+    """They ring like the rest of the face, and nothing changes below them."""
+    u, v, width, height = BOX
+    shown = panel((1, 255), (1, 210), (1, 90))
+    shown[:, v:, : u + left], shown[:, v:, u + width - right :] = 0, 0
+    assert image_region.find(shown, "screen", "crop=...") == (u, v - 3, width, height + 3)
+    assert image_region.find_below_ringing(shown, "screen", "clip=...") == (u + left, v, width - left - right, height)
+
+
+@pytest.mark.parametrize("level", [90, 255])
+def test_a_frame_is_no_end_without_contact(level):
+    """Its sides go on below; one that is darker than the face hides no ringing."""
+    u, v, width, height = BOX
+    for rows in (0, 3):
+        shown = panel(*[(1, 255), (1, 210), (1, 90)][:rows])
+        for screen in shown:
+            cv2.rectangle(screen, (u - 1, v - rows - 1), (u + width, v + height), level)
+        found = rows if level < 255 else 0
+        assert image_region.find(shown, "screen", "crop=...") == (u, v - found, width, height + found)
 
 
 @pytest.mark.parametrize("level", [60, 255])
