@@ -187,6 +187,8 @@ def _found(shown: Iterator[Grey]) -> Box | None:
 def even_clock(times: Times, name: str) -> tuple[float, float, float]:
     """First time, s, and rate, Hz, of even times that are nearest to time stamps : (n,) ns; and the most that one is off, s.
 
+    The first time is in whole ns, and the rate has the fewest digits by which the last time is right to half a one.
+
     Raises
     ------
     InputError
@@ -202,7 +204,9 @@ def even_clock(times: Times, name: str) -> tuple[float, float, float]:
             f"{name}: expected B-scans at an even rate, as images have no times of their own, found {found}; "
             "give layout=meza2021 frames=false, which has a pose for each"
         )
-    return 1e-9 * int(times[0]) + float(first), float(1 / period), off
+    rates = (float(f"{1 / period:.{digits}g}") for digits in range(1, 18))
+    rate = next(rate for rate in rates if abs(1 / rate - period) * numbers[-1] < 0.5e-9)
+    return float(Decimal(int(times[0]) + round(1e9 * first)).scaleb(-9)), rate, off
 
 
 def write_poses(path: Path, track: Track) -> None:

@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from sonotwin.cli import main
+from sonotwin.export_layouts import screen
 from tests.recon.clips import made_clips
 from tests.sonotwin.test_meza2021_verbs import contents
 
@@ -101,6 +102,18 @@ def test_stamps_become_the_nearest_even_ones(tmp_path, capsys):
 def test_the_clock_of_a_scanner_without_jitter_is_not_off(tmp_path, capsys):
     assert exported(captured(tmp_path / "capture"), tmp_path / "out") == 0
     assert "20 B-scans a second, which are 0.00 ms off" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rate_hz", [20, 29.97, 1e3 / 33])
+def test_first_time_and_rate_have_the_digits_that_count(rate_hz):
+    """A nanosecond at the end of the sweep is the clock's own."""
+    numbers = np.arange(2000)
+    times = 71_500_050_800_000 + np.rint(1e9 * numbers / rate_hz).astype(np.int64)
+    starts_s, rate, _ = screen.even_clock(times, "capture")
+    assert starts_s == 71500.0508 and len(f"{rate!r}") <= 14
+    assert np.abs(numbers / rate - numbers / rate_hz).max() < 1e-9
+    if rate_hz < 30:
+        assert rate == rate_hz
 
 
 @pytest.mark.parametrize(("pause_ms", "refused"), [(20, False), (400, True)])
