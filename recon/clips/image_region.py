@@ -1,9 +1,11 @@
 """The B-scan's part of a scanner's screen: what changes from frame to frame, less what is small, such as a clock.
 
-The face's ringing above it never changes: bright rows as wide as the B-scan. A frame or a header is wider, or apart from it.
+The face's ringing above it never changes: a few rows as wide as the B-scan, brightest at the face. A frame or a header is wider,
+darker, higher, or apart from it.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,6 +14,18 @@ from numpy.typing import NDArray
 from recon.clips.clip import Box
 from recon.errors import InputError
 from recon.model.fan import Mask, box
+
+
+@dataclass(frozen=True)
+class RingingLimits:
+    """Which rows right above what changes are the ringing of the probe's face. It fades with depth, by ripples."""
+
+    dark_dn: float = 8.0  # in the mean over time; darker rows are none
+    face_dn: float = 150.0  # of the brightest row, at least: transmission saturates the face, a title's ground is about 60
+    as_bright: float = 0.8  # of the brightest row, from which on a row may be the face: a compressed one is a little darker
+    across: float = 0.9  # share of the width that is above half of a row's level
+    height: float = 0.05  # of what changes, at most: ringing is 0.2 to 1 mm of 30 mm and more
+    ends: float = 0.05  # of the width, at most, on either side, at which an array has no contact throughout
 
 
 def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
@@ -25,9 +39,8 @@ def find(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
         If nothing of some size changes.
     """
     mean, deviation = over_time(frames)
-    u, v, width, height = box(changing(deviation, name, field))
-    top = _ringing(mean, u, v, width)
-    return _whole_or((u, top, width, height + v - top), mean.shape)
+    part = box(changing(deviation, name, field))
+    return _whole_or(_with_ringing(mean, part, RingingLimits()), mean.shape)
 
 
 def find_below_ringing(frames: Iterable[NDArray[np.uint8]], name: str, field: str) -> Box:
@@ -36,14 +49,32 @@ def find_below_ringing(frames: Iterable[NDArray[np.uint8]], name: str, field: st
     return _whole_or(box(changing(deviation, name, field)), deviation.shape)
 
 
-def _ringing(mean: NDArray[np.float32], u: int, v: int, width: int) -> int:
-    """The first row of those right above row v that are bright across the part's width, and dark on both sides, in the mean."""
-    bright_dn, nearly_all, beside_px = 8.0, 0.9, 3
-    bright = mean[:v] > bright_dn
-    within = bright[:, u : u + width].mean(axis=1) > nearly_all
-    beyond = np.hstack([bright[:, max(u - beside_px, 0) : u], bright[:, u + width : u + width + beside_px]]).any(axis=1)
-    others = np.flatnonzero(~within | beyond)
-    return int(others[-1]) + 1 if others.size else 0
+def _with_ringing(mean: NDArray[np.float32], part: Box, limits: RingingLimits) -> Box:
+    """The part with the face's ringing: rows right above it that are bright across its width, and dark beside it, in the mean.
+
+    The face is the topmost row about as bright as the brightest; what stands above it is a title. An end of the array that has no
+    contact rings, too, though nothing changes below it: the part gets as wide as the face's row.
+    """
+    u, v, width, height = part
+    most_px, levels, sides = limits.ends * width, [], []
+    for row in mean[:v][::-1]:
+        level = float(np.median(row[u : u + width]))
+        lit = row > level / 2
+        left, right = np.flatnonzero(~lit[:u]), np.flatnonzero(~lit[u + width :])
+        if level < limits.dark_dn or lit[u : u + width].mean() < limits.across or not left.size or not right.size:
+            break
+        wider = u - 1 - int(left[-1]), int(right[0])
+        if max(wider) > most_px:
+            break
+        levels.append(level)
+        sides.append(wider)
+    if max(levels, default=0.0) < limits.face_dn:
+        return part
+    rows = 1 + int(np.flatnonzero(np.array(levels) > limits.as_bright * max(levels))[-1])
+    (left, right), level = sides[rows - 1], levels[rows - 1]
+    ends = mean[v : v + height, u - left : u], mean[v : v + height, u + width : u + width + right]
+    framed = any(still.size and np.median(still) > level / 2 for still in ends)
+    return part if framed or rows > limits.height * height else (u - left, v - rows, left + width + right, height + rows)
 
 
 def _whole_or(part: Box, shape: tuple[int, ...]) -> Box:

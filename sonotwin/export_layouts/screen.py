@@ -60,7 +60,7 @@ def write(folder: Path, settings: Settings) -> list[str]:
     ------
     InputError
         If the capture or the probe's calibration is damaged, there is no such sweep, it has less than two B-scans or poses,
-        none of its B-scans has a pose, or they don't fit into the screen.
+        none of its B-scans has a pose, they pause, or they don't fit into the screen.
     """
     sweep = sweep_part.read_sweep(settings.source, settings.sweep, "volume", settings.implausible)
     _, part = manifest.read_manifest(settings.source).sweep_of(settings.source / MANIFEST, "a sweep", settings.sweep, "volume")
@@ -68,7 +68,7 @@ def write(folder: Path, settings: Settings) -> list[str]:
         if count < 2:
             raise InputError(f"{settings.source}: expected two {what} or more, as import-sweep takes, found {count}")
     found, placed = sweep.track.found, np.isfinite(sweep.poses()).all(axis=(1, 2))
-    box, (starts_s, rate_hz, off_s) = place(sweep.size, settings.screen_px), even_clock(sweep.times)
+    box, (starts_s, rate_hz, off_s) = place(sweep.size, settings.screen_px), even_clock(sweep.times, str(settings.source))
     probe = sweep.probe if settings.probe is None else probe_files.read(settings.probe)
     still = background(settings.screen_px, box, rate_hz, probe)
     for number, screen in enumerate(screens(sweep, still, box)):
@@ -91,7 +91,7 @@ def write(folder: Path, settings: Settings) -> list[str]:
     return [
         f"screen      {len(sweep.paths)} images of {width}x{height}, B-scans at crop=[{','.join(map(str, box))}], {finds}",
         f"poses       {found.sum()} of {len(found)} rows; {placed.sum()} of {len(placed)} B-scans have one",
-        f"clock       {rate_hz:.4g} B-scans a second, which are {1e3 * off_s:.2g} ms off their time stamps at most",
+        f"clock       {rate_hz:.4g} B-scans a second, which are {1e3 * off_s:.2f} ms off their time stamps at most",
         f"read        {shlex.join(['sonotwin', *command_line.words('import-sweep', reading)])}",
     ]
 
@@ -184,12 +184,29 @@ def _found(shown: Iterator[Grey]) -> Box | None:
         return None
 
 
-def even_clock(times: Times) -> tuple[float, float, float]:
-    """First time, s, and rate, Hz, of even times that are nearest to time stamps : (n,) ns; and the most that one is off, s."""
+def even_clock(times: Times, name: str) -> tuple[float, float, float]:
+    """First time, s, and rate, Hz, of even times that are nearest to time stamps : (n,) ns; and the most that one is off, s.
+
+    The first time is in whole ns, and the rate has the fewest digits by which the last time is right to half a one.
+
+    Raises
+    ------
+    InputError
+        If a stamp is off by more than half a period, as after a pause: poses of other B-scans would be nearer.
+    """
     seconds, numbers = 1e-9 * (times - times[0]), np.arange(len(times))
     first, period = np.polynomial.polynomial.polyfit(numbers, seconds, 1)
-    off = np.abs(seconds - first - period * numbers).max()
-    return 1e-9 * int(times[0]) + float(first), float(1 / period), float(off)
+    off = float(np.abs(seconds - first - period * numbers).max())
+    if off > period / 2:
+        apart = np.diff(seconds)
+        found = f"{apart.min():.4g} to {apart.max():.4g} s between them, the longest after B-scan {apart.argmax() + 1}"
+        raise InputError(
+            f"{name}: expected B-scans at an even rate, as images have no times of their own, found {found}; "
+            "give layout=meza2021 frames=false, which has a pose for each"
+        )
+    rates = (float(f"{1 / period:.{digits}g}") for digits in range(1, 18))
+    rate = next(rate for rate in rates if abs(1 / rate - period) * numbers[-1] < 0.5e-9)
+    return float(Decimal(int(times[0]) + round(1e9 * first)).scaleb(-9)), rate, off
 
 
 def write_poses(path: Path, track: Track) -> None:

@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from sonotwin.cli import main
+from sonotwin.export_layouts import screen
 from tests.recon.clips import made_clips
 from tests.sonotwin.test_meza2021_verbs import contents
 
@@ -94,8 +95,39 @@ def test_stamps_become_the_nearest_even_ones(tmp_path, capsys):
     said = capsys.readouterr().out
     off_ms = float(re.findall(r"which are (\S+) ms off", said)[0])
     read = read_back(said, tmp_path / "back").times
-    assert np.abs(read - jittered).max() == pytest.approx(off_ms * MS, rel=0.06)  # of two digits
+    assert np.abs(read - jittered).max() == pytest.approx(off_ms * MS, abs=0.005 * MS + 2)  # of two decimals
     assert 1 < off_ms < 5 and np.ptp(np.diff(read)) <= 2  # ns
+
+
+def test_the_clock_of_a_scanner_without_jitter_is_not_off(tmp_path, capsys):
+    assert exported(captured(tmp_path / "capture"), tmp_path / "out") == 0
+    assert "20 B-scans a second, which are 0.00 ms off" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rate_hz", [20, 29.97, 1e3 / 33])
+def test_first_time_and_rate_have_the_digits_that_count(rate_hz):
+    """A nanosecond at the end of the sweep is the clock's own."""
+    numbers = np.arange(2000)
+    times = 71_500_050_800_000 + np.rint(1e9 * numbers / rate_hz).astype(np.int64)
+    starts_s, rate, _ = screen.even_clock(times, "capture")
+    assert starts_s == 71500.0508 and len(f"{rate!r}") <= 14
+    assert np.abs(numbers / rate - numbers / rate_hz).max() < 1e-9
+    if rate_hz < 30:
+        assert rate == rate_hz
+
+
+@pytest.mark.parametrize(("pause_ms", "refused"), [(20, False), (400, True)])
+def test_a_sweep_that_pauses_is_no_recording(pause_ms, refused, tmp_path, capsys):
+    """Even times would lie nearer to other B-scans' stamps, and give wrong poses. There is a layout with a pose for each."""
+    times = stamps() + pause_ms * MS * (np.arange(COUNT) >= 8)
+    capture = captured(tmp_path / "capture", times=times)
+    assert exported(capture, tmp_path / "out") == (2 if refused else 0)
+    said = capsys.readouterr().err
+    if refused:
+        assert "capture: expected B-scans at an even rate, as images have no times of their own, found 0.05 to 0.45 s" in said
+        assert "between them, the longest after B-scan 8; give layout=meza2021 frames=false" in said
+        assert said.count("\n") == 1 and not (tmp_path / "out").exists()
+        assert main(["export", "layout=meza2021", "frames=false", f"capture={capture}", f"out={tmp_path / 'other'}"]) == 0
 
 
 def test_what_a_sweep_is_for_goes_along(tmp_path, capsys):

@@ -266,20 +266,75 @@ def test_the_b_scan_is_what_changes_on_the_screen(moved):
     ((255,), True),
 ])  # fmt: skip
 def test_the_ringing_of_the_face_belongs_to_the_b_scan(above, belongs):
-    """It is as wide as the B-scan; what is wider is a frame or a header, and a bright background is on all sides."""
+    """It is about as wide as the B-scan; what is wider is a frame or a header, and a bright background is on all sides."""
     u, v, width, height = BOX
     plain = np.zeros((12, *made_clips.SCREEN[::-1]), np.uint8)
     plain[:, v : v + height, u : u + width] = made_clips.scans(12)
     rows = np.array(above, np.uint8)[None, :, None]
     ringing, wider, bright = plain.copy(), plain.copy(), np.maximum(plain, 40)
     ringing[:, v - len(above) : v, u : u + width] = rows
-    wider[:, v - len(above) : v, u - 2 : u + width + 2] = rows
+    wider[:, v - len(above) : v, u - 8 : u + width + 8] = rows
     with_rows = np.count_nonzero(above) if belongs else 0
     expected = (u, v - with_rows, width, height + with_rows)
     assert image_region.find(ringing, "screen", "crop=...") == expected
     assert image_region.find_below_ringing(ringing, "screen", "clip=...") == BOX
     assert image_region.find(wider, "screen", "crop=...") == BOX
     assert image_region.find(bright, "screen", "crop=...") == BOX
+
+
+def panel(*above: tuple[int, int]) -> np.ndarray:
+    """Screens : (n, h, w), black but for the B-scan and rows above it, as wide, by their number and grey level from the top."""
+    u, v, width, height = BOX
+    shown = np.zeros((12, *made_clips.SCREEN[::-1]), np.uint8)
+    shown[:, v : v + height, u : u + width] = made_clips.scans(12)
+    levels = np.repeat([level for _, level in above], [count for count, _ in above])
+    shown[:, v - len(levels) : v, u : u + width] = levels[:, None]
+    return shown
+
+
+@pytest.mark.parametrize(("above", "rings"), [
+    ([(24, 60)], 0),
+    ([(4, 60)], 0),
+    ([(24, 255)], 0),  # far higher than any ringing
+    ([(24, 60), (1, 255), (1, 210), (1, 90)], 3),
+    ([(1, 60), (1, 255), (1, 120), (1, 180)], 3),  # it fades by ripples
+])  # fmt: skip
+def test_a_title_as_wide_as_the_b_scan_is_no_ringing(above, rings):
+    """Ringing is brightest at the face, and takes up a little of the depth."""
+    u, v, width, height = BOX
+    assert image_region.find(panel(*above), "screen", "crop=...") == (u, v - rings, width, height + rings)
+
+
+@pytest.mark.parametrize(("left", "right"), [(1, 0), (2, 2), (0, 5), (5, 5)])
+def test_ends_of_the_array_without_contact_belong_to_the_b_scan(left, right):
+    """They ring like the rest of the face, and nothing changes below them."""
+    u, v, width, height = BOX
+    shown = panel((1, 255), (1, 210), (1, 90))
+    shown[:, v:, : u + left], shown[:, v:, u + width - right :] = 0, 0
+    assert image_region.find(shown, "screen", "crop=...") == (u, v - 3, width, height + 3)
+    assert image_region.find_below_ringing(shown, "screen", "clip=...") == (u + left, v, width - left - right, height)
+
+
+@pytest.mark.parametrize("level", [90, 255])
+def test_a_frame_is_no_end_without_contact(level):
+    """Its sides go on below; one that is darker than the face hides no ringing."""
+    u, v, width, height = BOX
+    for rows in (0, 3):
+        shown = panel(*[(1, 255), (1, 210), (1, 90)][:rows])
+        for screen in shown:
+            cv2.rectangle(screen, (u - 1, v - rows - 1), (u + width, v + height), level)
+        found = rows if level < 255 else 0
+        assert image_region.find(shown, "screen", "crop=...") == (u, v - found, width, height + found)
+
+
+@pytest.mark.parametrize("level", [60, 255])
+@pytest.mark.parametrize("rows", [3, 60])
+def test_a_header_of_a_clip_as_wide_as_its_b_scan_is_no_ringing(rows, level):
+    """There nothing beside it shows that the header isn't wider."""
+    scans = made_clips.scans(12)
+    header = np.full((12, rows, scans.shape[2]), level, np.uint8)
+    scans = np.concatenate([np.zeros((12, 60 - rows, scans.shape[2]), np.uint8), header, scans], axis=1)
+    assert image_region.find(scans, "clip", "crop=...") == (0, 60, *BOX[2:])
 
 
 def test_a_clip_that_is_all_b_scan_stays_whole():
