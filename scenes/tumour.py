@@ -41,4 +41,8 @@ def golden_spiral(count: int) -> np.ndarray:
 
 def caliper(points: np.ndarray) -> float:
     """Greatest distance between two of the points : (n, 3), in their unit."""
-    return float(pdist(points[ConvexHull(points).vertices]).max())
+    outer = points[ConvexHull(points).vertices]
+    radii = np.linalg.norm(outer - (outer.min(axis=0) + outer.max(axis=0)) / 2, axis=1)
+    least = np.linalg.norm(outer - outer[radii.argmax()], axis=1).max()
+    ends = outer[radii >= least - radii.max() - 1e-9 * least]  # two points are no farther apart than the sum of their radii
+    return float(pdist(ends).max())
