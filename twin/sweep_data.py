@@ -39,17 +39,18 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
 
 
 def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:
-    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary is left."""
+    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary and no empty folder is left."""
+    places = [*(out / _name(number) for number in numbers), out, *out.parents]
+    missing = [place for place in places if not place.exists()]
     try:
         yield from results(engine, write, ((out, settings, number) for number in numbers))
     finally:
         for number in numbers:  # of workers that were ended with this process
             folder = out / _name(number)
             atomic.restore((folder / TRUTH, folder / CAPTURE))
+        for place in missing:
             with suppress(OSError):
-                folder.rmdir()
-        with suppress(OSError):
-            out.rmdir()
+                place.rmdir()
 
 
 def write(out: Path, settings: SweepSettings, number: int) -> int:

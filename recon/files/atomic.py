@@ -219,7 +219,7 @@ def restore(paths: Sequence[Path]) -> None:
     Nothing is done where another process is writing.
     """
     paths = [Path(os.path.realpath(path)) for path in paths]
-    if any(_leftovers(path) for path in paths):
+    if any(_leftovers(path) or _lock_of(path).exists() for path in paths):
         with ExitStack() as locks, suppress(Timeout):
             for path in sorted(paths):
                 locks.enter_context(alone(path, wait=False))

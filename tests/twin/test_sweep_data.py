@@ -90,6 +90,24 @@ def test_what_workers_had_begun_goes_away_when_one_is_refused(settings, tmp_path
     ]
 
 
+def test_a_run_that_is_refused_leaves_what_it_found(settings, tmp_path, monkeypatch):
+    """Empty folders, too; not so its own, nor the lock of a worker that was ended before it had made more."""
+
+    def refused(engine, work, tasks):
+        for out, _, number in tasks:
+            (out / f"{number:06d}").mkdir(parents=True, exist_ok=True)
+            (out / f"{number:06d}" / ".capture.lock").write_text("")
+        yield from ()
+        raise InputError("refused")
+
+    monkeypatch.setattr(sweep_data, "results", refused)
+    (tmp_path / "mine" / "000001").mkdir(parents=True)
+    for out in ("mine", "new/within"):
+        with pytest.raises(InputError, match="refused"):
+            list(sweep_data.make(tmp_path / out, settings, [0, 1], Engine()))
+    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == ["mine", "mine/000001"]
+
+
 @pytest.mark.slow
 def test_engines_give_the_same_bytes(settings, tmp_path):
     for name, engine in (("one", Engine()), ("two", Engine(workers=2)), ("dask", Engine(name="dask", workers=2))):

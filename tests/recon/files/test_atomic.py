@@ -281,6 +281,14 @@ def test_a_place_that_another_run_removes_meanwhile_can_be_written(tmp_path, mon
         atomic.check_folder(tmp_path / "other", "mark")
 
 
+def test_a_lock_alone_is_a_leftover(tmp_path):
+    """Of a process that was killed before it made anything else."""
+    for name in ("truth", "capture"):
+        (tmp_path / f".{name}.lock").write_text("")
+        atomic.restore([tmp_path / "truth", tmp_path / "capture"])
+        assert names(tmp_path) == []
+
+
 @pytest.mark.parametrize("atomically", [True, False])
 @pytest.mark.parametrize("calls", range(6))
 def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomically):
