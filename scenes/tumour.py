@@ -1,5 +1,7 @@
 """Lobulated tumours: closed, star-shaped, of an exact size."""
 
+from functools import cache
+
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
@@ -40,5 +42,23 @@ def golden_spiral(count: int) -> np.ndarray:
 
 
 def caliper(points: np.ndarray) -> float:
-    """Greatest distance between two of the points : (n, 3), in their unit."""
-    return float(pdist(points[ConvexHull(points).vertices]).max())
+    """Greatest distance between two of the points : (n, 3), in their unit.
+
+    A pair at distance L reaches along the nearest of many lines by L cos(a) at least, a being the greatest angle to it. Tried are
+    the lines along which the points reach as far as that, for an L that some pair has, and on each those so near to either end.
+    """
+    lines, cosine = _lines()
+    outer = points[ConvexHull(points).vertices]
+    along = lines @ outer.T
+    spans = outer[along.argmax(axis=1)] - outer[along.argmin(axis=1)]
+    least = cosine * np.linalg.norm(spans, axis=1).max() * (1 - 1e-9)  # for rounding
+    tried = along[np.ptp(along, axis=1) >= least]
+    return float(max(pdist(outer[(line >= line.min() + least) | (line <= line.max() - least)]).max() for line in tried))
+
+
+@cache
+def _lines() -> tuple[np.ndarray, float]:
+    """Directions : (321, 3) of lines, evenly in space, and the cosine of the greatest angle from any direction to the nearest."""
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    cosine = (sphere.face_normals * sphere.vertices[sphere.faces[:, 0]]).sum(axis=1).min()  # to the middle of the widest facet
+    return np.array(sphere.vertices[sphere.vertices @ [1, 0.1, 0.01] > 0]), float(cosine)
