@@ -5,6 +5,7 @@ that of the breast phantom.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
@@ -18,7 +19,7 @@ from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
-from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, form_of, world_from_phantom
+from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, depth_in, form_of, open_mesh, world_from_phantom
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
@@ -143,10 +144,10 @@ def build(config: Config) -> Scene:
         ),
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
-    bodies: list[trimesh.Trimesh] = []
+    bodies, below_skin = list[trimesh.Trimesh](), depth_in(open_mesh(skin))
     for k, (wanted, rng) in enumerate(zip(masses, _streams(config)[2].spawn(len(masses)), strict=True)):
         body = _lying(wanted, rng)
-        check_depth(f"masses.{k}", body, skin, config.least_mm)
+        check_depth(f"masses.{k}", body, below_skin, config.least_mm)
         bodies.append(body)
         _check_middles(masses, bodies)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
@@ -162,21 +163,34 @@ def skin_of(config: Config) -> Dome:
     return dome(form_of(config), _streams(config)[0])
 
 
-def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[Mass, ...]:
-    """Draw two or three masses of 8 to 20 mm, 3 mm apart, whose words go together.
+@dataclass(frozen=True)
+class DrawnMasses:
+    """How many masses are drawn, how large, and where their middles may lie in the breast's frame."""
+
+    count: tuple[int, int] = (2, 3)  # fewest and most: some to be told apart, with room between them
+    size_mm: tuple[float, float] = (8.0, 20.0)  # greatest extent: cancers of stage T1 are up to 20; the least assumed
+    beside_mm: tuple[float, float] = (38.0, 26.0)  # along x and y, to both sides; beyond, the usual breast has no room for most
+    above_mm: tuple[float, float] = (14.0, 38.0)  # over the chest: nearly all that is free in the usual breast, which is 52 high
+    apart_mm: float = 3.0  # at least, between spheres of their sizes about two: none touch in B-scans; assumed
+    tries: int = 200  # until there is said to be no room; at most 8 were needed in 40 usual breasts, 52 in small ones
+
+
+def draw_masses(config: Config, skin: Dome, rng: np.random.Generator, limits: DrawnMasses = DrawnMasses()) -> tuple[Mass, ...]:
+    """Draw masses, apart from each other, whose words go together.
 
     Raises
     ------
     InputError
         If no place is found for them.
     """
-    masses: list[Mass] = []
-    wanted = int(rng.integers(2, 4))
-    for _ in range(200):
+    masses, below_skin = list[Mass](), depth_in(open_mesh(skin))
+    wanted = int(rng.integers(*limits.count, endpoint=True))
+    (x, y), (lowest, highest) = limits.beside_mm, limits.above_mm
+    for _ in range(limits.tries):
         if len(masses) == wanted:
             break
-        size, form = float(rng.uniform(8, 20)), FORMS[rng.integers(len(FORMS))]
-        centre = rng.uniform([-38, -26, 14], [38, 26, 38])
+        size, form = float(rng.uniform(*limits.size_mm)), FORMS[rng.integers(len(FORMS))]
+        centre = rng.uniform([-x, -y, lowest], [x, y, highest])
         pattern: Pattern = "hypoechoic"
         if form == "round":
             pattern = "anechoic"
@@ -185,11 +199,12 @@ def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[M
         dark = BEHIND_DARK[rng.integers(len(BEHIND_DARK))]
         behind: Behind = "enhancement" if pattern == "anechoic" else dark if pattern == "hypoechoic" else "none"
         one = Mass(size_mm=size, centre_mm=tuple(centre.tolist()), form=form, pattern=pattern, behind=behind)
-        if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + 3 for other in masses):
+        if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + limits.apart_mm for other in masses):
             continue
         try:
             number = len(masses)
-            check_depth(f"masses.{number}", _lying(one, _streams(config)[2].spawn(number + 1)[number]), skin, config.least_mm)
+            body = _lying(one, _streams(config)[2].spawn(number + 1)[number])
+            check_depth(f"masses.{number}", body, below_skin, config.least_mm)
         except InputError:  # too near to skin or chest
             continue
         masses.append(one)
