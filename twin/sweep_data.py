@@ -66,13 +66,13 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
 def numbered(settings: SweepSettings, number: int) -> SweepSettings:
     """The settings of a sweep: of another seed, and of another patient where a scene is drawn by one, also with its own masses.
 
-    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Masses that are given are kept.
+    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Given masses are kept.
     """
     scene, parsed = settings.scene, parse_scene(settings.scene)[1]
-    usual = type(parsed).model_fields
-    if "seed" in usual:
+    fields = type(parsed).model_fields
+    if "seed" in fields:
         scene = scene | {"seed": parsed.seed + settings.seed + number}
-    if "masses" in usual and parsed.masses == usual["masses"].default:
+    if "masses" in fields and parsed.masses is None:
         scene = scene | {"masses": "drawn"}
     return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
 

@@ -104,6 +104,14 @@ class Mass(Part):
         )
 
 
+USUAL = (
+    Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
+    Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
+    Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
+)
+"""masses where none are given: a cancer, a cyst and a fibroadenoma"""
+
+
 class Config(Outside):
     """A patient's breast: its outside, its anatomy and its masses."""
 
@@ -112,12 +120,8 @@ class Config(Outside):
     nipple_height_mm: Positive = 5.0
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
     anatomy: Anatomy = Anatomy()
-    masses: tuple[Mass, ...] | Literal["drawn"] = (
-        Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
-        Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
-        Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
-    )
-    """each by hand, or `drawn`: two or three by the seed"""
+    masses: tuple[Mass, ...] | Literal["drawn"] | None = None
+    """each by hand, or `drawn`: two or three by the seed; if not given, the usual three, or drawn ones in each of many sweeps"""
     least_mm: Annotated[float, Field(ge=0, le=20)] = 2.0
     """of tissue between a mass and the skin or the chest"""
     chest_reflectance: Fraction = 0.45
@@ -132,7 +136,10 @@ def build(config: Config) -> Scene:
         If a mass lies too near to the skin or to the chest, or outside, or one has another's middle in it.
     """
     skin, colour_rng = skin_of(config), _streams(config)[1]
-    masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2])) if config.masses == "drawn" else config.masses
+    if config.masses == "drawn":
+        masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2]))
+    else:
+        masses = USUAL if config.masses is None else config.masses
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
     things = [
@@ -154,8 +161,10 @@ def build(config: Config) -> Scene:
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
-    drawn = {"masses": [one.model_dump(mode="json") for one in masses]} if config.masses == "drawn" else None
-    return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world), drawn=drawn)
+    layers = partial(_layers, config.anatomy, skin, config.seed, world)
+    told = {"masses": [one.model_dump(mode="json") for one in masses]}
+    drawn, usual = told if config.masses == "drawn" else None, told if config.masses is None else None
+    return Scene("patient", tuple(things), layers=layers, drawn=drawn, usual=usual)
 
 
 def skin_of(config: Config) -> Dome:

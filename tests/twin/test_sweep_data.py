@@ -6,6 +6,7 @@ import re
 import pytest
 
 from recon.errors import InputError
+from scenes.kinds import patient
 from twin import sweep_data
 from twin.engine import Engine
 from twin.filmed_sweep import SweepSettings
@@ -37,8 +38,10 @@ def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
 
 def test_patients_have_drawn_masses_unless_they_are_given(settings):
     given = [{"size_mm": 9.0, "centre_mm": (0.0, 0.0, 20.0)}]
-    for masses, expected in (({}, "drawn"), ({"masses": given}, given), ({"masses": []}, [])):
-        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, **masses}})
+    usual = [one.model_dump(mode="json") for one in patient.USUAL]
+    for masses in (None, given, usual, [], "drawn"):
+        expected = "drawn" if masses is None else masses
+        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, "masses": masses}})
         scenes = [sweep_data.numbered(chosen, number).scene for number in range(2)]
         assert [scene["seed"] for scene in scenes] == [24, 25] and [scene["masses"] for scene in scenes] == [expected] * 2
 

@@ -1,15 +1,18 @@
 """The patient: masses by their words, refused where they lie outside, layers that are grown only where they are asked for."""
 
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial import Delaunay, cKDTree
 
 from recon.errors import InputError
 from scenes.acoustics import TISSUES, tissue_of
 from scenes.anatomy import Anatomy
 from scenes.kinds import breast, patient
+from twin.session import describe
 
 COARSE = {"edge_mm": 3.0, "anatomy": Anatomy(voxel_mm=2.0)}
 
@@ -108,6 +111,18 @@ def test_a_draw_searches_one_tree(monkeypatch):
     with pytest.raises(InputError, match=r"^masses: expected room for [23] drawn ones, found it for 0; give them,"):
         patient.draw_masses(config, patient.skin_of(config), np.random.default_rng(5), limits)
     assert len(made) == 1
+
+
+def test_usual_masses_are_those_that_the_settings_show():
+    """In a comment, and in the truth of scenes that none are given for."""
+    lines = (Path(__file__).parents[3] / "conf" / "scene" / "patient.yaml").read_text(encoding="utf-8").splitlines()
+    shown = yaml.safe_load("\n".join(line.strip()[2:] for line in lines if line.strip().startswith("# - {")))
+    assert tuple(patient.Mass(**one) for one in shown) == patient.USUAL
+    usual, given = built(), built(masses=shown)
+    pairs = zip(usual.things, given.things, strict=True)
+    assert all((one.mesh.vertices == two.mesh.vertices).all() and one.tissue == two.tissue for one, two in pairs)
+    assert describe(usual)["usual"]["masses"] == [one.model_dump(mode="json") for one in patient.USUAL]
+    assert "drawn" not in describe(usual) and not {"usual", "drawn"} & set(describe(given))
 
 
 def test_layers_lie_in_the_world_and_are_the_same_each_time():
