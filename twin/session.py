@@ -184,7 +184,7 @@ class Session:
 
 
 def describe(scene: Scene, **more: object) -> dict[str, object]:
-    """Describe a scene for evaluation: its name, what is drawn or usual in it, what a part adds, such as labels, and primitives."""
+    """Describe a scene for evaluation: its name, what is drawn or usual in it, what a part adds, and primitives."""
     shapes = []
     for shape in scene.shapes:
         values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}

@@ -1,10 +1,14 @@
 """Many sweeps: each of its own patient and hand, resumed, and of the same bytes on any engine."""
 
 import hashlib
+import json
 import re
+from contextlib import nullcontext
+from copy import deepcopy
 
 import pytest
 
+from recon.capture.manifest import MANIFEST
 from recon.errors import InputError
 from scenes.kinds import patient
 from twin import sweep_data
@@ -54,11 +58,32 @@ def test_sweeps_that_are_there_are_kept(settings, tmp_path):
     for change, difference in (
         ({"seed": 5}, "seed: expected 5 as in this run, found 4"),
         ({"path": Hold(seconds=0.2)}, "path.seconds: expected 0.2 as in this run, found 0.1"),
-        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found None"),
+        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found 0.75"),
     ):
         there = f"{tmp_path / '000000' / 'truth' / 'settings.json'}: {difference}, another sweep; choose another out"
         with pytest.raises(InputError, match=rf"^{re.escape(there)}$"):
             sweep_data.missing(tmp_path, settings.model_copy(update=change), 1)
+
+
+def test_settings_that_a_set_was_begun_before_have_their_defaults_in_it(settings, tmp_path):
+    """So that it goes on; a field that is gone, or one of another value, is another set's."""
+    truth, capture = tmp_path / "000000" / "truth", tmp_path / "000000" / "capture"
+    truth.mkdir(parents=True)
+    capture.mkdir()
+    (capture / MANIFEST).touch()
+    chosen = settings.model_copy(update={"scene": {"kind": "breast", "seed": 7, "roughness": 0.5, "edge_mm": 0.75}})
+    whole = sweep_data.numbered(chosen, 0).model_dump(mode="json")
+    for change, found in (
+        (lambda one: one["living"].pop("element_mm"), None),
+        (lambda one: one["scene"].pop("edge_mm"), None),
+        (lambda one: one["scene"].pop("roughness"), r"scene\.roughness: expected 0\.5 as in this run, found 0\.\d+,"),
+        (lambda one: one["living"].update(element_mm=5.0), r"living\.element_mm: expected 3\.0 as in this run, found 5\.0,"),
+        (lambda one: one["living"].update(gone=1), r"living\.gone: expected None as in this run, found 1,"),
+    ):
+        change(stored := deepcopy(whole))
+        (truth / "settings.json").write_text(json.dumps(stored), encoding="utf-8")
+        with nullcontext() if found is None else pytest.raises(InputError, match=found):
+            assert sweep_data.missing(tmp_path, chosen, 1) == []
 
 
 def test_foreign_files_are_not_replaced(settings, tmp_path):
