@@ -26,7 +26,7 @@ WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 @contextmanager
 def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Hold the lock in a file, which goes away with it.
+    """Hold the lock in a file, which goes away with it; its folder is made, and on failure goes away again if it is empty.
 
     Parameters
     ----------
@@ -38,31 +38,42 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
     Timeout
         If another one holds it, and there is no wait.
     """
-    lock = FileLock(path, fallback_to_soft=False)
+    lock, missing = FileLock(path, fallback_to_soft=False), list[Path]()
     try:
-        _acquire(lock, 0.0 if announce is None else PATIENCE_S)
-    except Timeout:
-        if announce is None:
-            raise
-        announce(holder(path))
-        _acquire(lock, -1.0)
-    with suppress(OSError):  # Windows lets nobody write to a file that is locked; a note isn't worth an error
-        path.write_text(this_process(), encoding="utf-8")
-    try:
-        yield
-    finally:
-        with suppress(OSError):  # Windows refuses, and removes it on release
-            path.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
-        lock.release()
+        try:
+            _acquire(lock, 0.0 if announce is None else PATIENCE_S, missing)
+        except Timeout:
+            if announce is None:
+                raise
+            announce(holder(path))
+            _acquire(lock, -1.0, missing)
+        with suppress(OSError):  # Windows lets nobody write to a file that is locked; a note isn't worth an error
+            path.write_text(this_process(), encoding="utf-8")
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows refuses, and removes it on release
+                path.unlink()  # before the release: whoever waits then sees that its file is gone, and makes a new one
+            lock.release()
+    except BaseException:
+        for folder in missing:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
 
 
-def _acquire(lock: FileLock, timeout_s: float) -> None:
-    """Acquire a lock; go on without where the disk has none."""
+def _acquire(lock: FileLock, timeout_s: float, missing: list[Path]) -> None:
+    """Acquire a lock; go on without where the disk has none. Folders made for it are added to `missing`, the inner ones first."""
+    folder = Path(lock.lock_file).parent
     while True:
+        missing += [place for place in (folder, *folder.parents) if not place.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire(timeout=timeout_s)
         except OSError as error:
             if error.errno == errno.ESTALE:  # on NFS: its file went away with the holder before
+                continue
+            if error.errno == errno.ENOENT and not folder.exists():  # it, too: the holder had made it, and failed
                 continue
             if error.errno not in WITHOUT_LOCKS:
                 raise

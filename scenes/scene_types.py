@@ -104,3 +104,4 @@ class Scene:
     shapes: tuple[Shape, ...] = ()
     layers: Callable[[], Layers] | None = None  # grows them for ultrasound, which takes seconds; the same each time
     drawn: Mapping[str, Any] | None = None  # what its seed has drawn, as fields of its kind, for the truth
+    usual: Mapping[str, Any] | None = None  # what it has where nothing was given, in the same way

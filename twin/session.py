@@ -184,13 +184,13 @@ class Session:
 
 
 def describe(scene: Scene, **more: object) -> dict[str, object]:
-    """Describe a scene for evaluation: its name, what was drawn, what a part adds, such as names of labels, and primitives."""
+    """Describe a scene for evaluation: its name, what is drawn or usual in it, what a part adds, and primitives."""
     shapes = []
     for shape in scene.shapes:
         values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
         shapes.append({"kind": type(shape).__name__.lower(), **values})
-    drawn = {"drawn": dict(scene.drawn)} if scene.drawn else {}
-    return {"name": scene.name, **drawn, **more, "shapes": shapes}
+    filled = {key: dict(fields) for key, fields in (("drawn", scene.drawn), ("usual", scene.usual)) if fields}
+    return {"name": scene.name, **filled, **more, "shapes": shapes}
 
 
 def write_json(path: Path, content: object) -> None:

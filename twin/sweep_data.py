@@ -1,8 +1,11 @@
 """Data sets of sweeps: each of its own patient and hand, in a folder of its own, whatever the engine and its workers."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
 
 from recon.capture.manifest import MANIFEST, SCANNER, sweep_part
 from recon.errors import InputError, brief
@@ -27,8 +30,11 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
         one = _session(out, settings, number)
         path = one.truth.folder / SETTINGS
         if path.is_file() and (one.capture / MANIFEST).is_file():
-            wanted_first = {"seed": one.settings["seed"], **one.settings}  # the seed, by which scenes differ, too
-            name, wanted, there = first_difference(wanted_first, read_json(path))
+            stored = read_json(path)
+            name, wanted, there = _difference(one.settings, stored)
+            if name:
+                with suppress(InputError, ValidationError):  # a field that is gone
+                    name, wanted, there = _difference(_complete(one.settings), _complete(stored))
             if name:
                 expected = f"expected {brief(wanted)} as in this run, found {brief(there)}, another sweep"
                 raise InputError(f"{path}: {name}: {expected}; choose another out")
@@ -39,17 +45,18 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
 
 
 def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:
-    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary is left."""
+    """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary and no empty folder is left."""
+    places = [*(out / _name(number) for number in numbers), out, *out.parents]
+    missing = [place for place in places if not place.exists()]
     try:
         yield from results(engine, write, ((out, settings, number) for number in numbers))
     finally:
         for number in numbers:  # of workers that were ended with this process
             folder = out / _name(number)
             atomic.restore((folder / TRUTH, folder / CAPTURE))
+        for place in missing:
             with suppress(OSError):
-                folder.rmdir()
-        with suppress(OSError):
-            out.rmdir()
+                place.rmdir()
 
 
 def write(out: Path, settings: SweepSettings, number: int) -> int:
@@ -65,15 +72,27 @@ def write(out: Path, settings: SweepSettings, number: int) -> int:
 def numbered(settings: SweepSettings, number: int) -> SweepSettings:
     """The settings of a sweep: of another seed, and of another patient where a scene is drawn by one, also with its own masses.
 
-    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Masses that are given are kept.
+    Scenes count from `scene.seed` on by the sweep's seed, so that runs of seeds apart share none. Given masses are kept.
     """
     scene, parsed = settings.scene, parse_scene(settings.scene)[1]
-    usual = type(parsed).model_fields
-    if "seed" in usual:
+    fields = type(parsed).model_fields
+    if "seed" in fields:
         scene = scene | {"seed": parsed.seed + settings.seed + number}
-    if "masses" in usual and parsed.masses == usual["masses"].default:
+    if "masses" in fields and parsed.masses is None:
         scene = scene | {"masses": "drawn"}
     return settings.model_copy(update={"seed": settings.seed + number, "scene": scene})
+
+
+def _difference(wanted: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[str, Any, Any]:
+    """As `first_difference`: the seed first, by which scenes differ, too."""
+    return first_difference({"seed": wanted["seed"], **wanted}, found)
+
+
+def _complete(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored settings with the defaults of fields that they lack: there may have been no such fields when they were written."""
+    read = SweepSettings.model_validate(settings)
+    scene = {"kind": read.scene.get("kind"), **parse_scene(read.scene)[1].model_dump(mode="json")}
+    return read.model_dump(mode="json") | {"scene": scene}
 
 
 def _name(number: int) -> str:

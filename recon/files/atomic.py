@@ -81,8 +81,7 @@ def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = Mapp
         for path in sorted(paths):
             _check_no_file(path)
             _check_writable(path, path.parent)
-            locks.enter_context(_standing(path.parent))
-            locks.enter_context(alone(path))
+            locks.enter_context(alone(path))  # which makes its folder
         _put_back(paths)
         for path in paths:
             check_folder(path, by[path], adds=additions.get(path))
@@ -93,20 +92,6 @@ def new_folders(places: Mapping[Path, str], adds: Mapping[Path, Addition] = Mapp
     for path in paths:
         if path not in additions and (others := written_files.foreign(path)):
             log.warning("%s: kept %s, which this run didn't write", path, ", ".join(others[:3]) + " ..." * (len(others) > 3))
-
-
-@contextmanager
-def _standing(folder: Path) -> Iterator[None]:
-    """Make a folder and those above it that are missing; on failure they go away again, but for what isn't empty."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        yield
-    except BaseException:
-        for place in missing:
-            with suppress(OSError):
-                place.rmdir()
-        raise
 
 
 def begin_filled(folder: Path, by: str) -> None:
@@ -234,7 +219,7 @@ def restore(paths: Sequence[Path]) -> None:
     Nothing is done where another process is writing.
     """
     paths = [Path(os.path.realpath(path)) for path in paths]
-    if any(_leftovers(path) for path in paths):
+    if any(_leftovers(path) or _lock_of(path).exists() for path in paths):
         with ExitStack() as locks, suppress(Timeout):
             for path in sorted(paths):
                 locks.enter_context(alone(path, wait=False))
@@ -353,6 +338,9 @@ def _check_writable(path: Path, folder: Path) -> None:
         with TemporaryDirectory(prefix=".", dir=there):
             pass
     except OSError as error:
+        if not there.exists():  # another process has failed meanwhile, and removed what it had made
+            _check_writable(path, folder)
+            return
         raise InputError(f"{path}: expected a place to write to, found {there} not writable: {error.strerror}") from None
 
 

@@ -3,6 +3,7 @@
 Skin relief, areola, table and tumours are drawn from a seed; sizes are exact.
 """
 
+from collections.abc import Callable
 from typing import Annotated
 
 import numpy as np
@@ -25,6 +26,7 @@ from scenes.tumour import tumour
 MADE_OF = {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"}  # for ultrasound; see `scenes.acoustics`
 
 Array = rigid.Array
+Depth = Callable[[Array], Array]  # of points : (n, 3) below a surface, (n,) mm; negative on the outer side
 
 
 class Tumour(Part):
@@ -98,13 +100,13 @@ def build(config: Config) -> Scene:
     shape_rng, colour_rng, tumour_rng = np.random.default_rng(config.seed).spawn(3)
     skin = dome(form_of(config), shape_rng)
     breast = closed(skin)
-    streams = tumour_rng.spawn(len(config.tumours))
+    streams, depth_below = tumour_rng.spawn(len(config.tumours)), depth_in(open_mesh(skin))
     masses = [
         solid_meshes.moved(tumour(wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
         for wanted, rng in zip(config.tumours, streams, strict=True)
     ]
     for k, mass in enumerate(masses):
-        check_depth(f"tumours.{k}", mass, skin, config.tissue_mm)
+        check_depth(f"tumours.{k}", mass, depth_below, config.tissue_mm)
         _check_apart(k, masses)
 
     world = world_from_phantom(config)
@@ -161,10 +163,9 @@ def albedo(config: Outside, skin: Dome, rng: np.random.Generator) -> NDArray[np.
     return np.clip(np.append(mottle * value, config.reflectance), 0, 1).astype(np.float32)
 
 
-def check_depth(name: str, mass: trimesh.Trimesh, skin: Dome, least_mm: float) -> None:
+def check_depth(name: str, mass: trimesh.Trimesh, below_skin: Depth, least_mm: float) -> None:
     """Refuse a mass that has less than `least_mm` of tissue to the skin or the base, or lies outside; InputError."""
-    to_skin = depth(mass.vertices, trimesh.Trimesh(skin.vertices, skin.faces, process=False)).min()
-    tissue = min(to_skin, mass.vertices[:, 2].min())
+    tissue = min(below_skin(mass.vertices).min(), mass.vertices[:, 2].min())
     if tissue < least_mm:
         raise InputError(f"{name}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
 
@@ -180,6 +181,21 @@ def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
 
 def depth(points: Array, surface: trimesh.Trimesh) -> Array:
     """Distance of points : (n, 3) to a surface's nearest vertex : (n,) mm, positive on the inner side."""
-    distance, nearest = surface_tree(surface.vertices).query(points)
-    outwards = ((points - surface.vertices[nearest]) * surface.vertex_normals[nearest]).sum(axis=1) > 0
-    return np.where(outwards, -distance, distance)
+    return depth_in(surface)(points)
+
+
+def depth_in(surface: trimesh.Trimesh) -> Depth:
+    """As `depth`, of one surface for points again and again."""
+    vertices, normals, tree = surface.vertices.view(np.ndarray), surface.vertex_normals, surface_tree(surface.vertices)
+
+    def depth(points: Array) -> Array:
+        distance, nearest = tree.query(points)
+        outwards = ((points - vertices[nearest]) * normals[nearest]).sum(axis=1) > 0
+        return np.where(outwards, -distance, distance)
+
+    return depth
+
+
+def open_mesh(skin: Dome) -> trimesh.Trimesh:
+    """The dome without a base."""
+    return trimesh.Trimesh(skin.vertices, skin.faces, process=False)

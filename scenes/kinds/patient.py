@@ -5,6 +5,7 @@ that of the breast phantom.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
 
@@ -18,7 +19,7 @@ from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
-from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, form_of, world_from_phantom
+from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, depth_in, form_of, open_mesh, world_from_phantom
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
@@ -103,6 +104,14 @@ class Mass(Part):
         )
 
 
+USUAL = (
+    Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
+    Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
+    Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
+)
+"""masses where none are given: a cancer, a cyst and a fibroadenoma"""
+
+
 class Config(Outside):
     """A patient's breast: its outside, its anatomy and its masses."""
 
@@ -111,12 +120,8 @@ class Config(Outside):
     nipple_height_mm: Positive = 5.0
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
     anatomy: Anatomy = Anatomy()
-    masses: tuple[Mass, ...] | Literal["drawn"] = (
-        Mass(size_mm=19.0, centre_mm=(-16.0, 8.0, 25.0), form="spiculated", behind="shadow", calcified=True),
-        Mass(size_mm=14.0, centre_mm=(26.0, 18.0, 22.0), form="oval", pattern="anechoic", behind="enhancement"),
-        Mass(size_mm=11.0, centre_mm=(24.0, -24.0, 20.0), form="lobulated"),
-    )
-    """each by hand, or `drawn`: two or three by the seed"""
+    masses: tuple[Mass, ...] | Literal["drawn"] | None = None
+    """each by hand, or `drawn`: two or three by the seed; if not given, the usual three, or drawn ones in each of many sweeps"""
     least_mm: Annotated[float, Field(ge=0, le=20)] = 2.0
     """of tissue between a mass and the skin or the chest"""
     chest_reflectance: Fraction = 0.45
@@ -131,7 +136,10 @@ def build(config: Config) -> Scene:
         If a mass lies too near to the skin or to the chest, or outside, or one has another's middle in it.
     """
     skin, colour_rng = skin_of(config), _streams(config)[1]
-    masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2])) if config.masses == "drawn" else config.masses
+    if config.masses == "drawn":
+        masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2]))
+    else:
+        masses = USUAL if config.masses is None else config.masses
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
     things = [
@@ -143,18 +151,20 @@ def build(config: Config) -> Scene:
         ),
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
-    bodies: list[trimesh.Trimesh] = []
+    bodies, below_skin = list[trimesh.Trimesh](), depth_in(open_mesh(skin))
     for k, (wanted, rng) in enumerate(zip(masses, _streams(config)[2].spawn(len(masses)), strict=True)):
         body = _lying(wanted, rng)
-        check_depth(f"masses.{k}", body, skin, config.least_mm)
+        check_depth(f"masses.{k}", body, below_skin, config.least_mm)
         bodies.append(body)
         _check_middles(masses, bodies)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
-    drawn = {"masses": [one.model_dump(mode="json") for one in masses]} if config.masses == "drawn" else None
-    return Scene("patient", tuple(things), layers=partial(_layers, config.anatomy, skin, config.seed, world), drawn=drawn)
+    layers = partial(_layers, config.anatomy, skin, config.seed, world)
+    told = {"masses": [one.model_dump(mode="json") for one in masses]}
+    drawn, usual = told if config.masses == "drawn" else None, told if config.masses is None else None
+    return Scene("patient", tuple(things), layers=layers, drawn=drawn, usual=usual)
 
 
 def skin_of(config: Config) -> Dome:
@@ -162,21 +172,34 @@ def skin_of(config: Config) -> Dome:
     return dome(form_of(config), _streams(config)[0])
 
 
-def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[Mass, ...]:
-    """Draw two or three masses of 8 to 20 mm, 3 mm apart, whose words go together.
+@dataclass(frozen=True)
+class DrawnMasses:
+    """How many masses are drawn, how large, and where their middles may lie in the breast's frame."""
+
+    count: tuple[int, int] = (2, 3)  # fewest and most: some to be told apart, with room between them
+    size_mm: tuple[float, float] = (8.0, 20.0)  # greatest extent: cancers of stage T1 are up to 20; the least assumed
+    beside_mm: tuple[float, float] = (38.0, 26.0)  # along x and y, to both sides; beyond, the usual breast has no room for most
+    above_mm: tuple[float, float] = (14.0, 38.0)  # over the chest: nearly all that is free in the usual breast, which is 52 high
+    apart_mm: float = 3.0  # at least, between spheres of their sizes about two: none touch in B-scans; assumed
+    tries: int = 200  # until there is said to be no room; at most 8 were needed in 40 usual breasts, 52 in small ones
+
+
+def draw_masses(config: Config, skin: Dome, rng: np.random.Generator, limits: DrawnMasses = DrawnMasses()) -> tuple[Mass, ...]:
+    """Draw masses, apart from each other, whose words go together.
 
     Raises
     ------
     InputError
         If no place is found for them.
     """
-    masses: list[Mass] = []
-    wanted = int(rng.integers(2, 4))
-    for _ in range(200):
+    masses, below_skin = list[Mass](), depth_in(open_mesh(skin))
+    wanted = int(rng.integers(*limits.count, endpoint=True))
+    (x, y), (lowest, highest) = limits.beside_mm, limits.above_mm
+    for _ in range(limits.tries):
         if len(masses) == wanted:
             break
-        size, form = float(rng.uniform(8, 20)), FORMS[rng.integers(len(FORMS))]
-        centre = rng.uniform([-38, -26, 14], [38, 26, 38])
+        size, form = float(rng.uniform(*limits.size_mm)), FORMS[rng.integers(len(FORMS))]
+        centre = rng.uniform([-x, -y, lowest], [x, y, highest])
         pattern: Pattern = "hypoechoic"
         if form == "round":
             pattern = "anechoic"
@@ -185,11 +208,12 @@ def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[M
         dark = BEHIND_DARK[rng.integers(len(BEHIND_DARK))]
         behind: Behind = "enhancement" if pattern == "anechoic" else dark if pattern == "hypoechoic" else "none"
         one = Mass(size_mm=size, centre_mm=tuple(centre.tolist()), form=form, pattern=pattern, behind=behind)
-        if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + 3 for other in masses):
+        if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + limits.apart_mm for other in masses):
             continue
         try:
             number = len(masses)
-            check_depth(f"masses.{number}", _lying(one, _streams(config)[2].spawn(number + 1)[number]), skin, config.least_mm)
+            body = _lying(one, _streams(config)[2].spawn(number + 1)[number])
+            check_depth(f"masses.{number}", body, below_skin, config.least_mm)
         except InputError:  # too near to skin or chest
             continue
         masses.append(one)

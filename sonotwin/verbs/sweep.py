@@ -49,6 +49,7 @@ from rich.progress import Progress
 
 from recon.capture.manifest import CAMERAS, SCANNER, sweep_part
 from recon.model.rig import PROBE
+from scenes.catalogue import parse_scene
 from sonotwin.console_watch import ConsoleWatch, LineConsole
 from twin import sweep_data
 from twin.engine import Engine
@@ -100,7 +101,8 @@ def run(config: Config) -> None:
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None
     session = Session(config.out, sweep_part(config.name), settings, config.add, devices, purpose)
     session.check()
-    console.print(f"scene       {config.scene.get('kind', 'of no kind')}, setting it up")
+    parse_scene(config.scene)
+    console.print(f"scene       {config.scene['kind']}, setting it up")
     with console.status("setting up the scene"):
         planned = plan_sweep(config)
         film = filming(planned, console) if config.filmed else None

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 from scipy.spatial.distance import pdist
 
+from scenes.mass_forms import mass
 from scenes.tumour import caliper, tumour
 
 
@@ -24,6 +26,9 @@ def test_a_tumour_is_closed_and_of_the_asked_size(size, seed):
 def test_the_caliper_is_the_largest_of_all_distances():
     points = np.random.default_rng(3).standard_normal((300, 3))
     assert caliper(points) == pytest.approx(pdist(points).max())
+    for form in ("round", "spiculated"):  # whose points nearly all lie as far out, and hardly any
+        body = mass(form, 13.0, np.random.default_rng(3)).vertices * [1, 0.97, 0.9]
+        assert caliper(body) == pdist(body[ConvexHull(body).vertices]).max()
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -1,6 +1,7 @@
 """`sonotwin sweep`: what it writes, what the pipeline makes of it, and what it refuses before it renders."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -186,6 +187,14 @@ def test_what_is_set_up_is_said_before(tmp_path, monkeypatch, capsys, count, sai
     monkeypatch.setattr(f"{'sonotwin.verbs.sweep' if count == 1 else 'twin.sweep_data'}.plan_sweep", plan)
     assert main(["sweep", "scene=patient", f"count={count}", f"out={tmp_path / 'out'}"]) == 2
     assert lines == [f"scene       patient, setting it up{said}\n"]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_scene_of_no_kind_is_refused_before_it_is_set_up(tmp_path, capsys, count):
+    assert main(["sweep", "~scene.kind", f"count={count}", f"out={tmp_path / 'out'}"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and re.fullmatch(r"sonotwin: .*scene: kind: expected one of .*, found none\n", said.err)
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_place_that_is_taken_is_refused(tmp_path, capsys):

@@ -1,11 +1,16 @@
 """Many sweeps: each of its own patient and hand, resumed, and of the same bytes on any engine."""
 
 import hashlib
+import json
 import re
+from contextlib import nullcontext
+from copy import deepcopy
 
 import pytest
 
+from recon.capture.manifest import MANIFEST
 from recon.errors import InputError
+from scenes.kinds import patient
 from twin import sweep_data
 from twin.engine import Engine
 from twin.filmed_sweep import SweepSettings
@@ -37,8 +42,10 @@ def test_each_sweep_has_a_seed_and_a_patient_of_its_own(settings):
 
 def test_patients_have_drawn_masses_unless_they_are_given(settings):
     given = [{"size_mm": 9.0, "centre_mm": (0.0, 0.0, 20.0)}]
-    for masses, expected in (({}, "drawn"), ({"masses": given}, given), ({"masses": []}, [])):
-        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, **masses}})
+    usual = [one.model_dump(mode="json") for one in patient.USUAL]
+    for masses in (None, given, usual, [], "drawn"):
+        expected = "drawn" if masses is None else masses
+        chosen = settings.model_copy(update={"scene": {"kind": "patient", "seed": 20, "masses": masses}})
         scenes = [sweep_data.numbered(chosen, number).scene for number in range(2)]
         assert [scene["seed"] for scene in scenes] == [24, 25] and [scene["masses"] for scene in scenes] == [expected] * 2
 
@@ -51,11 +58,32 @@ def test_sweeps_that_are_there_are_kept(settings, tmp_path):
     for change, difference in (
         ({"seed": 5}, "seed: expected 5 as in this run, found 4"),
         ({"path": Hold(seconds=0.2)}, "path.seconds: expected 0.2 as in this run, found 0.1"),
-        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found None"),
+        ({"scene": {"kind": "breast", "edge_mm": 1.0}}, "scene.edge_mm: expected 1.0 as in this run, found 0.75"),
     ):
         there = f"{tmp_path / '000000' / 'truth' / 'settings.json'}: {difference}, another sweep; choose another out"
         with pytest.raises(InputError, match=rf"^{re.escape(there)}$"):
             sweep_data.missing(tmp_path, settings.model_copy(update=change), 1)
+
+
+def test_settings_that_a_set_was_begun_before_have_their_defaults_in_it(settings, tmp_path):
+    """So that it goes on; a field that is gone, or one of another value, is another set's."""
+    truth, capture = tmp_path / "000000" / "truth", tmp_path / "000000" / "capture"
+    truth.mkdir(parents=True)
+    capture.mkdir()
+    (capture / MANIFEST).touch()
+    chosen = settings.model_copy(update={"scene": {"kind": "breast", "seed": 7, "roughness": 0.5, "edge_mm": 0.75}})
+    whole = sweep_data.numbered(chosen, 0).model_dump(mode="json")
+    for change, found in (
+        (lambda one: one["living"].pop("element_mm"), None),
+        (lambda one: one["scene"].pop("edge_mm"), None),
+        (lambda one: one["scene"].pop("roughness"), r"scene\.roughness: expected 0\.5 as in this run, found 0\.\d+,"),
+        (lambda one: one["living"].update(element_mm=5.0), r"living\.element_mm: expected 3\.0 as in this run, found 5\.0,"),
+        (lambda one: one["living"].update(gone=1), r"living\.gone: expected None as in this run, found 1,"),
+    ):
+        change(stored := deepcopy(whole))
+        (truth / "settings.json").write_text(json.dumps(stored), encoding="utf-8")
+        with nullcontext() if found is None else pytest.raises(InputError, match=found):
+            assert sweep_data.missing(tmp_path, chosen, 1) == []
 
 
 def test_foreign_files_are_not_replaced(settings, tmp_path):
@@ -88,6 +116,24 @@ def test_what_workers_had_begun_goes_away_when_one_is_refused(settings, tmp_path
         "shared/000001",
         "shared/000001/notes.txt",
     ]
+
+
+def test_a_run_that_is_refused_leaves_what_it_found(settings, tmp_path, monkeypatch):
+    """Empty folders, too; not so its own, nor the lock of a worker that was ended before it had made more."""
+
+    def refused(engine, work, tasks):
+        for out, _, number in tasks:
+            (out / f"{number:06d}").mkdir(parents=True, exist_ok=True)
+            (out / f"{number:06d}" / ".capture.lock").write_text("")
+        yield from ()
+        raise InputError("refused")
+
+    monkeypatch.setattr(sweep_data, "results", refused)
+    (tmp_path / "mine" / "000001").mkdir(parents=True)
+    for out in ("mine", "new/within"):
+        with pytest.raises(InputError, match="refused"):
+            list(sweep_data.make(tmp_path / out, settings, [0, 1], Engine()))
+    assert [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.rglob("*"))] == ["mine", "mine/000001"]
 
 
 @pytest.mark.slow

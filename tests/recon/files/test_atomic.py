@@ -244,6 +244,51 @@ def test_folders_made_for_those_that_failed_go_away(tmp_path, error):
     assert names(tmp_path / "mine") == [] and names(tmp_path / "shared") == ["notes.txt"]
 
 
+def test_folders_that_a_failed_run_removes_are_not_left_by_one_that_waited_for_it(tmp_path):
+    """The second one's lock has made them again."""
+    (tmp_path / "mine").mkdir()
+    for outer in ("mine", "new"):
+        place = f"{outer}/a/b/capture"
+        with pytest.raises(KeyboardInterrupt), atomic.new_folder(tmp_path / place, "mark"):
+            other = program(
+                tmp_path, f'file_locks.PATIENCE_S = 0.0\nwith atomic.new_folder(Path("{place}"), "mark"): raise SystemExit(7)'
+            )
+            assert "waiting" in other.stderr.readline()
+            raise KeyboardInterrupt
+        assert other.wait() == 7 and other.stderr.read() == ""
+    assert names(tmp_path) == ["mine"] and names(tmp_path / "mine") == []
+
+
+def test_a_place_that_another_run_removes_meanwhile_can_be_written(tmp_path, monkeypatch):
+    """It had made the folder, and fails just before it is tried; a place that is there but takes nothing is still refused."""
+    (tmp_path / "new").mkdir()
+    made = atomic.TemporaryDirectory
+
+    def once_removed(prefix, dir):
+        if Path(dir).name == "new" and not names(Path(dir)):
+            Path(dir).rmdir()
+        return made(prefix=prefix, dir=dir)
+
+    def refusing(prefix, dir):
+        raise FileNotFoundError(2, "No such file or directory")  # as /proc says
+
+    monkeypatch.setattr(atomic, "TemporaryDirectory", once_removed)
+    with atomic.new_folder(tmp_path / "new" / "out", "mark"):
+        pass
+    assert (tmp_path / "new" / "out").is_dir()
+    monkeypatch.setattr(atomic, "TemporaryDirectory", refusing)
+    with pytest.raises(InputError, match="not writable"):
+        atomic.check_folder(tmp_path / "other", "mark")
+
+
+def test_a_lock_alone_is_a_leftover(tmp_path):
+    """Of a process that was killed before it made anything else."""
+    for name in ("truth", "capture"):
+        (tmp_path / f".{name}.lock").write_text("")
+        atomic.restore([tmp_path / "truth", tmp_path / "capture"])
+        assert names(tmp_path) == []
+
+
 @pytest.mark.parametrize("atomically", [True, False])
 @pytest.mark.parametrize("calls", range(6))
 def test_a_killed_process_leaves_old_folders_or_new_ones(tmp_path, calls, atomically):

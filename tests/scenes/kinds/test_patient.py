@@ -1,13 +1,18 @@
 """The patient: masses by their words, refused where they lie outside, layers that are grown only where they are asked for."""
 
+from itertools import combinations
+from pathlib import Path
+
 import numpy as np
 import pytest
-from scipy.spatial import Delaunay
+import yaml
+from scipy.spatial import Delaunay, cKDTree
 
 from recon.errors import InputError
 from scenes.acoustics import TISSUES, tissue_of
 from scenes.anatomy import Anatomy
-from scenes.kinds import patient
+from scenes.kinds import breast, patient
+from twin.session import describe
 
 COARSE = {"edge_mm": 3.0, "anatomy": Anatomy(voxel_mm=2.0)}
 
@@ -66,8 +71,58 @@ def test_drawn_masses_are_the_seeds_and_are_told():
     assert again.drawn is None and 2 <= len(first.drawn["masses"]) <= 3
     config = patient.Config(**COARSE, seed=9)
     others = patient.draw_masses(config, patient.skin_of(config), np.random.default_rng([9, 2]))
-    assert all(8 <= one.size_mm <= 20 for one in others)
     assert not {one.centre_mm[0] for one in others} & {one["centre_mm"][0] for one in first.drawn["masses"]}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Drawn masses of some patients."""
+    configs = [patient.Config(**COARSE, seed=seed) for seed in range(16)]
+    return [patient.draw_masses(one, patient.skin_of(one), np.random.default_rng([one.seed, 2])) for one in configs]
+
+
+def test_drawn_masses_lie_apart(drawn):
+    """By 3 mm: spheres of their sizes, and so the bodies, but for half a millimetre by which one isn't about its middle."""
+    for seed, masses in enumerate(drawn):
+        streams = patient._streams(patient.Config(seed=seed))[2].spawn(len(masses))
+        bodies = [patient._lying(one, rng) for one, rng in zip(masses, streams, strict=True)]
+        for (one, body), (two, other) in combinations(zip(masses, bodies, strict=True), 2):
+            assert np.linalg.norm(np.subtract(one.centre_mm, two.centre_mm)) >= (one.size_mm + two.size_mm) / 2 + 3
+            assert cKDTree(body.vertices).query(other.vertices)[0].min() > 2.5
+
+
+def test_the_words_of_drawn_masses_go_together(drawn):
+    """Round ones are cysts, which enhance; shadows lie behind dark ones; those with uneven borders are dark."""
+    masses = [one for some in drawn for one in some]
+    assert {one.form for one in masses} == set(patient.FORMS)
+    assert {one.behind for one in masses} == {"none", "shadow", "enhancement"}
+    for one in masses:
+        assert (one.behind == "enhancement") == (one.pattern == "anechoic")
+        assert one.pattern == "anechoic" or one.form != "round"
+        assert one.pattern == "hypoechoic" or (one.behind != "shadow" and one.form in patient.CIRCUMSCRIBED)
+
+
+def test_a_draw_searches_one_tree(monkeypatch):
+    """However many places it tries; no room is said if there is none."""
+    made, tree = [], breast.surface_tree
+    monkeypatch.setattr(breast, "surface_tree", lambda points: made.append(len(points)) or tree(points))
+    config = patient.Config(**COARSE, least_mm=20.0)
+    limits = patient.DrawnMasses(size_mm=(10.0, 11.0), tries=4)
+    with pytest.raises(InputError, match=r"^masses: expected room for [23] drawn ones, found it for 0; give them,"):
+        patient.draw_masses(config, patient.skin_of(config), np.random.default_rng(5), limits)
+    assert len(made) == 1
+
+
+def test_usual_masses_are_those_that_the_settings_show():
+    """In a comment, and in the truth of scenes that none are given for."""
+    lines = (Path(__file__).parents[3] / "conf" / "scene" / "patient.yaml").read_text(encoding="utf-8").splitlines()
+    shown = yaml.safe_load("\n".join(line.strip()[2:] for line in lines if line.strip().startswith("# - {")))
+    assert tuple(patient.Mass(**one) for one in shown) == patient.USUAL
+    usual, given = built(), built(masses=shown)
+    pairs = zip(usual.things, given.things, strict=True)
+    assert all((one.mesh.vertices == two.mesh.vertices).all() and one.tissue == two.tissue for one, two in pairs)
+    assert describe(usual)["usual"]["masses"] == [one.model_dump(mode="json") for one in patient.USUAL]
+    assert "drawn" not in describe(usual) and not {"usual", "drawn"} & set(describe(given))
 
 
 def test_layers_lie_in_the_world_and_are_the_same_each_time():
