@@ -63,7 +63,8 @@ def _envelope(
     paths = shaded(clear, near, transducer, world_from_image) if near else clear
     echoes = scatter(scene, transducer, spread, paths, world_from_image, seed)
     echoes += surface_echoes(scene, transducer, spread, paths, world_from_image, seed)
-    echoes += wire_echoes(scene, transducer, spread, paths, world_from_image, seed)
+    if scene.wires:
+        echoes += wire_echoes(scene, transducer, spread, paths, world_from_image, seed)
     for tool in near:
         others = [other for other in near if other is not tool]
         lit = shaded(clear, others, transducer, world_from_image) if others else clear

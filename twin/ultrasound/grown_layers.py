@@ -127,6 +127,13 @@ def layer_at(sure, among, distance, half_mm, first, per_mm, x, y, z):
     return NONE
 
 
+@njit(inline="always")
+def in_cell(distance, half_mm, cell, layer):
+    """Signed distance of a layer at a place of a cell; FAR_MM beside the grid."""
+    d, half = within(distance, cell, layer) if cell.i >= 0 else FAR_MM, half_mm[layer]
+    return abs(d) - half if half > 0 else d
+
+
 @kernel
 def layer_distance(distance, half_mm, first, per_mm, layer, x, y, z):
     """Signed distance of a layer at a point of the world; FAR_MM beside the grid."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.compiled import kernel, njit
+from twin.trilinear import cell_at
 from twin.ultrasound import borders
 from twin.ultrasound.beam import STEP_MM, Beam
 from twin.ultrasound.borders import BUNDLE, NEAR, START, STOP
@@ -18,6 +19,7 @@ from twin.ultrasound.echo_field import BESIDE_MM, Field, deposit, field_like, la
 from twin.ultrasound.echo_solids import (
     Body,
     Wire,
+    own_distance,
     resting_distance,
     resting_label,
     resting_place,
@@ -25,7 +27,7 @@ from twin.ultrasound.echo_solids import (
     shrinking,
     turned,
 )
-from twin.ultrasound.grown_layers import patch_at
+from twin.ultrasound.grown_layers import in_cell, patch_at
 from twin.ultrasound.medium import hashed
 from twin.ultrasound.scan_lines import lines_of, on_lines, widening, world_from_lines
 from twin.ultrasound.sound_paths import Paths, reflection, resting_normal, table_at
@@ -235,13 +237,16 @@ def _crossings_of(ray, crossings, distances, solids, spans, bundle, beam, repeat
 @njit(inline="always")
 def _measure(ray, t, solids, sides, distances):
     """Measure the distances at a depth of a ray; returns a step that crosses no border."""
-    near = STEPS_MM[1]
+    near, (first, end), grown = STEPS_MM[1], solids.layers, solids.grown
     x, y, z = resting_place(solids, ray.x + ray.dx * t, ray.y + ray.dy * t, ray.z + ray.dz * t)
+    cell = cell_at(grown.first, grown.per_mm, grown.distance.shape, x, y, z)
     for solid in range(len(sides)):
         distances[BEFORE, solid] = distances[AFTER, solid]
         distances[AFTER, solid] = sides[solid]  # its sign counts, where the span has none of its borders
         if sides[solid] == NEAR:
-            d = shrinking(solids) * resting_distance(solids, solid, x, y, z)
+            layered = first <= solid < end  # all in one cell
+            own = in_cell(grown.distance, grown.half_mm, cell, solid - first) if layered else own_distance(solids, solid, x, y, z)
+            d = shrinking(solids) * own
             distances[AFTER, solid] = d
             near = min(near, SURE * abs(d))
     return near
