@@ -107,7 +107,7 @@ def _of_corners(values: NDArray[np.float32], bound: np.ufunc) -> NDArray[np.floa
     return values
 
 
-@kernel
+@njit(inline="always")
 def layer_at(sure, among, distance, half_mm, first, per_mm, x, y, z):
     """The last layer that holds a point of the world, or NONE."""
     cell = cell_at(first, per_mm, distance.shape, x, y, z)
@@ -172,7 +172,7 @@ def _side(distance, first, per_mm, layer, x, y, z):
     return FAR_MM if cell.i < 0 else within(distance, cell, layer)
 
 
-@kernel
+@njit(inline="always")
 def uneven_at(uneven, first, per_mm, x, y, z):
     """Amplitude of backscatter over its tissue's at a point of the world: of the nearest point of the grid."""
     i, j, k = int((x - first[0]) * per_mm + 0.5), int((y - first[1]) * per_mm + 0.5), int((z - first[2]) * per_mm + 0.5)
@@ -181,7 +181,7 @@ def uneven_at(uneven, first, per_mm, x, y, z):
     return uneven[i, j, k]
 
 
-@kernel(fastmath=True)
+@njit(inline="always")
 def strand_at(strata, strands, first, per_mm, x, y, z):
     """Unevenness from strand to strand at a point of the world: of what lies along one face, from the same strand."""
     cell = cell_at(first, per_mm, strata.shape, x, y, z)
