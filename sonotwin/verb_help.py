@@ -50,7 +50,7 @@ def make(verb: str, module: str) -> str:
     source = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     parts = [f"usage: sonotwin {verb} [field=value ...]", ast.get_docstring(source) or ""]
     settings = next((node for node in source.body if isinstance(node, ast.ClassDef) and node.name == "Config"), None)
-    if settings is not None and not any(isinstance(node, ast.AnnAssign) for node in settings.body):
+    if settings is not None and _has_no_fields(settings):
         return "\n\n".join(parts)
     from recon import interrupts
     from sonotwin import config
@@ -62,6 +62,12 @@ def make(verb: str, module: str) -> str:
     if choices:
         parts.append("choices:\n\n" + "\n".join(f"  {group}={'|'.join(names)}" for group, names in choices.items()))
     return "\n\n".join(parts)
+
+
+def _has_no_fields(settings: ast.ClassDef) -> bool:
+    """Whether settings have no fields of their own, and inherit none."""
+    inherits = [ast.unparse(base) for base in settings.bases] != ["Part"]
+    return not inherits and not any(isinstance(node, ast.AnnAssign) for node in settings.body)
 
 
 def _state() -> str:

@@ -25,6 +25,8 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
     InputError
         If a sweep of other settings, or something else, is in the place of one.
     """
+    if (single := out / CAPTURE).is_dir():
+        raise InputError(f"{single}: expected nothing, found a single sweep beside which many would be; choose another out")
     found = []
     for number in range(count):
         one = _session(out, settings, number)
@@ -42,6 +44,13 @@ def missing(out: Path, settings: SweepSettings, count: int) -> list[int]:
             one.check()
             found.append(number)
     return found
+
+
+def check_alone(out: Path) -> None:
+    """Refuse the folder of many sweeps for a single one; InputError."""
+    first = out / _name(0) / CAPTURE
+    if first.is_dir():
+        raise InputError(f"{first}: expected nothing, found the first of many sweeps; choose another out, or give count")
 
 
 def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:

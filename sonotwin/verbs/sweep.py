@@ -96,6 +96,7 @@ def run(config: Config) -> None:
     if config.count > 1:
         render_many(config, console)
         return
+    sweep_data.check_alone(config.out)
     settings = config.settings().model_dump(mode="json")
     devices = (SCANNER, *(CAMERAS if config.filmed else ()))
     purpose = sweep_session.PURPOSES[config.path.kind] if config.name or config.filmed else None

@@ -84,6 +84,11 @@ def test_help_of_a_verb(verb, no_texts, monkeypatch, capsys):
     assert capsys.readouterr().out == text
 
 
+def test_help_has_fields_that_settings_inherit(no_texts, capsys):
+    assert cli.main(["export", "--help"]) == 0
+    assert "  screen_px: " in capsys.readouterr().out
+
+
 def test_help_is_made_anew_after_a_change_and_where_nothing_can_be_kept(no_texts, monkeypatch):
     """One file a verb is kept, whatever became of the last one."""
     made = iter(("first", "second", "third", "fourth"))

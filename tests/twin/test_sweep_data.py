@@ -65,6 +65,16 @@ def test_sweeps_that_are_there_are_kept(settings, tmp_path):
             sweep_data.missing(tmp_path, settings.model_copy(update=change), 1)
 
 
+def test_one_sweep_and_many_dont_mix(settings, tmp_path):
+    sweep_data.check_alone(tmp_path)
+    (tmp_path / "000000" / "capture").mkdir(parents=True)
+    with pytest.raises(InputError, match="expected nothing, found the first of many sweeps; choose another out"):
+        sweep_data.check_alone(tmp_path)
+    (tmp_path / "capture").mkdir()
+    with pytest.raises(InputError, match="expected nothing, found a single sweep"):
+        sweep_data.missing(tmp_path, settings, 2)
+
+
 def test_settings_that_a_set_was_begun_before_have_their_defaults_in_it(settings, tmp_path):
     """So that it goes on; a field that is gone, or one of another value, is another set's."""
     truth, capture = tmp_path / "000000" / "truth", tmp_path / "000000" / "capture"
