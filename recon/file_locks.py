@@ -46,9 +46,10 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
             if announce is None:
                 raise
             announce(holder(path))
+            missing += _made_by_holder(path)
             _acquire(lock, -1.0, missing)
         with suppress(OSError):  # Windows lets nobody write to a file that is locked; a note isn't worth an error
-            path.write_text(this_process(), encoding="utf-8")
+            path.write_text(f"{this_process()}{len(set(missing))} folders made\n", encoding="utf-8")
         try:
             yield
         finally:
@@ -60,6 +61,15 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
             with suppress(OSError):
                 folder.rmdir()
         raise
+
+
+def _made_by_holder(path: Path) -> list[Path]:
+    """Folders that a lock's holder has made for it, the inner ones first: if it fails and can't remove them, who waited does."""
+    try:
+        made = path.read_text(encoding="utf-8", errors="replace").splitlines()[1].split()[0]
+        return list(path.parents)[: int(made)]
+    except (OSError, ValueError, IndexError):
+        return []
 
 
 def _acquire(lock: FileLock, timeout_s: float, missing: list[Path]) -> None:

@@ -244,8 +244,8 @@ def test_folders_made_for_those_that_failed_go_away(tmp_path, error):
     assert names(tmp_path / "mine") == [] and names(tmp_path / "shared") == ["notes.txt"]
 
 
-def test_a_run_that_waited_for_one_that_failed_is_done_as_if_it_had_not_waited(tmp_path):
-    """The first one removes the folders that it had made, and the second one makes them again."""
+def test_folders_that_a_failed_run_removes_are_not_left_by_one_that_waited_for_it(tmp_path):
+    """The second one's lock has made them again, or was there before the first one could remove them."""
     (tmp_path / "mine").mkdir()
     for outer in ("mine", "new"):
         place = f"{outer}/a/b/capture"
@@ -256,7 +256,29 @@ def test_a_run_that_waited_for_one_that_failed_is_done_as_if_it_had_not_waited(t
             assert "waiting" in other.stderr.readline()
             raise KeyboardInterrupt
         assert other.wait() == 7 and other.stderr.read() == ""
-    assert (tmp_path / "mine").is_dir() and not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert names(tmp_path) == ["mine"] and names(tmp_path / "mine") == []
+
+
+def test_one_that_waited_removes_what_the_first_one_could_not(tmp_path, monkeypatch):
+    """It has its lock in there when the first one clears up, and fails later."""
+    remove, others = Path.rmdir, []
+
+    def late(folder):
+        while "held" not in others[0].stderr.readline():
+            pass
+        monkeypatch.setattr(Path, "rmdir", remove)
+        remove(folder)
+
+    lines = ["file_locks.PATIENCE_S = 0.0", 'with atomic.new_folder(Path("new/a/capture"), "mark"):']
+    lines += ['    print("held", file=__import__("sys").stderr, flush=True)', '    while not Path("go").exists(): pass']
+    with pytest.raises(KeyboardInterrupt), atomic.new_folder(tmp_path / "new/a/capture", "mark"):
+        others.append(program(tmp_path, "\n".join([*lines, "    raise SystemExit(7)"])))
+        assert "waiting" in others[0].stderr.readline()
+        monkeypatch.setattr(Path, "rmdir", late)
+        raise KeyboardInterrupt
+    assert names(tmp_path) == ["new"]
+    (tmp_path / "go").touch()
+    assert others[0].wait() == 7 and names(tmp_path) == ["go"]
 
 
 def test_a_place_that_another_run_removes_meanwhile_can_be_written(tmp_path, monkeypatch):

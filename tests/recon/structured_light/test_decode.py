@@ -38,7 +38,7 @@ def smooth_maps(patterns, rng, shape=SHAPE):
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=3, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**31))
 def test_round_trip(name, seed):
     """Pattern -> camera -> decode gives back the map to the predicted noise, for arbitrary smooth maps and each sequence."""
@@ -55,7 +55,7 @@ def test_round_trip(name, seed):
             continue
         assert value is not None and sigma is not None
         z = ((value - maps[axis]) / sigma)[ok]
-        assert np.abs(z).max() < 7  # 50 000 normal values stay below 5; rounding and the curvature within a pixel add one
+        assert np.abs(z).max() < 6  # 50 000 normal values stay below 5; rounding and the curvature within a pixel add a little
         assert z.std() < 1.2
         assert np.isnan(value[~np.isfinite(sigma)]).all()
 
