@@ -4,7 +4,7 @@ World is the frame of camera 1, lengths in mm: z points away from the camera int
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,13 +64,13 @@ class Thing:
     primitive: Sphere | None = None  # the exact shape that the mesh approximates, for a renderer that has one
 
     def __post_init__(self) -> None:
-        for field, values in (("albedo", self.albedo), ("wet", self.wet)):
+        for kind, values in (("albedo", self.albedo), ("wet", self.wet)):
             if values is None:
                 continue
             if values.shape != (len(self.mesh.vertices),):
-                raise ValueError(f"{self.name}: {field}: expected {len(self.mesh.vertices)} values, found shape {values.shape}")
+                raise ValueError(f"{self.name}: {kind}: expected {len(self.mesh.vertices)} values, found shape {values.shape}")
             if not ((values >= 0) & (values <= 1)).all():
-                raise ValueError(f"{self.name}: {field}: expected values from 0 to 1")
+                raise ValueError(f"{self.name}: {kind}: expected values from 0 to 1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,5 +103,4 @@ class Scene:
     things: tuple[Thing, ...]
     shapes: tuple[Shape, ...] = ()
     layers: Callable[[], Layers] | None = None  # grows them for ultrasound, which takes seconds; the same each time
-    drawn: Mapping[str, Any] | None = None  # what its seed has drawn, as fields of its kind, for the truth
-    usual: Mapping[str, Any] | None = None  # what it has where nothing was given, in the same way
+    filled: Mapping[str, Any] = field(default_factory=dict)  # fields that weren't given, under `drawn` or `usual`, for the truth

@@ -189,8 +189,7 @@ def describe(scene: Scene, **more: object) -> dict[str, object]:
     for shape in scene.shapes:
         values = {key: np.asarray(value).tolist() for key, value in asdict(shape).items()}
         shapes.append({"kind": type(shape).__name__.lower(), **values})
-    filled = {key: dict(fields) for key, fields in (("drawn", scene.drawn), ("usual", scene.usual)) if fields}
-    return {"name": scene.name, **filled, **more, "shapes": shapes}
+    return {"name": scene.name, **scene.filled, **more, "shapes": shapes}
 
 
 def write_json(path: Path, content: object) -> None:

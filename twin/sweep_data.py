@@ -56,14 +56,14 @@ def check_alone(out: Path) -> None:
 def make(out: Path, settings: SweepSettings, numbers: list[int], engine: Engine) -> Generator[int, None, None]:
     """Render sweeps; gives the B-scans of each as it is done. However it ends, nothing temporary and no empty folder is left."""
     places = [*(out / _name(number) for number in numbers), out, *out.parents]
-    missing = [place for place in places if not place.exists()]
+    absent = [place for place in places if not place.exists()]
     try:
         yield from results(engine, write, ((out, settings, number) for number in numbers))
     finally:
         for number in numbers:  # of workers that were ended with this process
             folder = out / _name(number)
             atomic.restore((folder / TRUTH, folder / CAPTURE))
-        for place in missing:
+        for place in absent:
             with suppress(OSError):
                 place.rmdir()
 

@@ -165,9 +165,13 @@ def albedo(config: Outside, skin: Dome, rng: np.random.Generator) -> NDArray[np.
 
 def check_depth(name: str, mass: trimesh.Trimesh, below_skin: Depth, least_mm: float) -> None:
     """Refuse a mass that has less than `least_mm` of tissue to the skin or the base, or lies outside; InputError."""
-    tissue = min(below_skin(mass.vertices).min(), mass.vertices[:, 2].min())
-    if tissue < least_mm:
+    if (tissue := least_tissue(mass, below_skin)) < least_mm:
         raise InputError(f"{name}: expected at least {least_mm:g} mm of tissue to skin and base, found {tissue:.2f} mm")
+
+
+def least_tissue(mass: trimesh.Trimesh, below_skin: Depth) -> float:
+    """Least tissue, mm, between a mass and the skin or the base; negative where it reaches out."""
+    return float(min(below_skin(mass.vertices).min(), mass.vertices[:, 2].min()))
 
 
 def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:

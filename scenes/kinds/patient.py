@@ -19,7 +19,18 @@ from recon.model.rig import Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
 from scenes.anatomy import Anatomy, grow, in_world
 from scenes.dome import Dome, dome
-from scenes.kinds.breast import Outside, albedo, check_depth, closed, depth, depth_in, form_of, open_mesh, world_from_phantom
+from scenes.kinds.breast import (
+    Outside,
+    albedo,
+    check_depth,
+    closed,
+    depth,
+    depth_in,
+    form_of,
+    least_tissue,
+    open_mesh,
+    world_from_phantom,
+)
 from scenes.mass_forms import MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
@@ -135,11 +146,11 @@ def build(config: Config) -> Scene:
     InputError
         If a mass lies too near to the skin or to the chest, or outside, or one has another's middle in it.
     """
-    skin, colour_rng = skin_of(config), _streams(config)[1]
+    skin, (_, colour_rng, mass_rng) = skin_of(config), _streams(config)
     if config.masses == "drawn":
-        masses = draw_masses(config, skin, np.random.default_rng([config.seed, 2]))
+        masses, by = draw_masses(config, skin, np.random.default_rng([config.seed, 2])), "drawn"
     else:
-        masses = USUAL if config.masses is None else config.masses
+        masses, by = (USUAL, "usual") if config.masses is None else (config.masses, "")
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
     things = [
@@ -152,7 +163,7 @@ def build(config: Config) -> Scene:
         Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng)),
     ]
     bodies, below_skin = list[trimesh.Trimesh](), depth_in(open_mesh(skin))
-    for k, (wanted, rng) in enumerate(zip(masses, _streams(config)[2].spawn(len(masses)), strict=True)):
+    for k, (wanted, rng) in enumerate(zip(masses, mass_rng.spawn(len(masses)), strict=True)):
         body = _lying(wanted, rng)
         check_depth(f"masses.{k}", body, below_skin, config.least_mm)
         bodies.append(body)
@@ -162,9 +173,8 @@ def build(config: Config) -> Scene:
         if wanted.pattern == "complex":
             things.append(_solid_part(f"solid{k}", wanted, rng, world))
     layers = partial(_layers, config.anatomy, skin, config.seed, world)
-    told = {"masses": [one.model_dump(mode="json") for one in masses]}
-    drawn, usual = told if config.masses == "drawn" else None, told if config.masses is None else None
-    return Scene("patient", tuple(things), layers=layers, drawn=drawn, usual=usual)
+    filled = {by: {"masses": [one.model_dump(mode="json") for one in masses]}} if by else {}
+    return Scene("patient", tuple(things), layers=layers, filled=filled)
 
 
 def skin_of(config: Config) -> Dome:
@@ -210,13 +220,9 @@ def draw_masses(config: Config, skin: Dome, rng: np.random.Generator, limits: Dr
         one = Mass(size_mm=size, centre_mm=tuple(centre.tolist()), form=form, pattern=pattern, behind=behind)
         if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + limits.apart_mm for other in masses):
             continue
-        try:
-            number = len(masses)
-            body = _lying(one, _streams(config)[2].spawn(number + 1)[number])
-            check_depth(f"masses.{number}", body, below_skin, config.least_mm)
-        except InputError:  # too near to skin or chest
-            continue
-        masses.append(one)
+        body = _lying(one, _streams(config)[2].spawn(len(masses) + 1)[-1])
+        if least_tissue(body, below_skin) >= config.least_mm:
+            masses.append(one)
     if len(masses) < wanted:
         raise InputError(f"masses: expected room for {wanted} drawn ones, found it for {len(masses)}; give them, or another seed")
     return tuple(masses)

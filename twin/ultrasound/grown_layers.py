@@ -1,6 +1,7 @@
 """Layers of tissue that have grown on one grid, point by point: a place costs one look for all of them.
 
-Kernels are compiled apart from their callers, and take no more than what they read: handing over costs more than looking.
+What loops ask for at each place is inlined in them, as handing arrays over costs more than looking; what they ask for less
+often are kernels, compiled apart from them.
 """
 
 from collections.abc import Sequence
@@ -137,8 +138,7 @@ def in_cell(distance, half_mm, cell, layer):
 @kernel
 def layer_distance(distance, half_mm, first, per_mm, layer, x, y, z):
     """Signed distance of a layer at a point of the world; FAR_MM beside the grid."""
-    d, half = _side(distance, first, per_mm, layer, x, y, z), half_mm[layer]
-    return abs(d) - half if half > 0 else d
+    return in_cell(distance, half_mm, cell_at(first, per_mm, distance.shape, x, y, z), layer)
 
 
 @kernel

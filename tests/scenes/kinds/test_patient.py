@@ -65,13 +65,13 @@ def test_masses_may_touch():
 def test_drawn_masses_are_the_seeds_and_are_told():
     """Other ones by another seed, and those that are told, given by hand, are the same bodies."""
     first = built(masses="drawn", seed=8)
-    again = built(masses=first.drawn["masses"], seed=8)
+    again = built(masses=first.filled["drawn"]["masses"], seed=8)
     pairs = zip(first.things, again.things, strict=True)
     assert all((one.mesh.vertices == two.mesh.vertices).all() and one.tissue == two.tissue for one, two in pairs)
-    assert again.drawn is None and 2 <= len(first.drawn["masses"]) <= 3
+    assert again.filled == {} and 2 <= len(first.filled["drawn"]["masses"]) <= 3
     config = patient.Config(**COARSE, seed=9)
     others = patient.draw_masses(config, patient.skin_of(config), np.random.default_rng([9, 2]))
-    assert not {one.centre_mm[0] for one in others} & {one["centre_mm"][0] for one in first.drawn["masses"]}
+    assert not {one.centre_mm[0] for one in others} & {one["centre_mm"][0] for one in first.filled["drawn"]["masses"]}
 
 
 @pytest.fixture(scope="module")
