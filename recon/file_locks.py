@@ -45,8 +45,8 @@ def held(path: Path, announce: Callable[[str], None] | None = None) -> Iterator[
         except Timeout:
             if announce is None:
                 raise
+            missing += _made_by_holder(path)  # first: the holder may end, and its note with it, while it is announced
             announce(holder(path))
-            missing += _made_by_holder(path)
             _acquire(lock, -1.0, missing)
         with suppress(OSError):  # Windows lets nobody write to a file that is locked; a note isn't worth an error
             path.write_text(f"{this_process()}{len(set(missing))} folders made\n", encoding="utf-8")
