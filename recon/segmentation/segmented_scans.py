@@ -17,6 +17,7 @@ from recon.model.probe import SCANNER_SPEED
 from recon.segmentation import contact, mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
+from recon.segmentation.left_out import LeftOut
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
@@ -38,6 +39,7 @@ class Segmented:
     figures: Metrics
     lines: list[str]  # for the console
     overlays: list[Overlay]
+    left_out: tuple[LeftOut, ...] = ()  # by a search for masses
 
 
 def find_masses(
@@ -62,8 +64,8 @@ def find_masses(
     scans = freehand_scans.in_memory(scans)  # they are read five times and more
     sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
-    found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
-    figures: Metrics = {"tissue_grey": grey, "masses": len(found)}
+    found, left_out = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
+    figures: Metrics = {"tissue_grey": grey, "masses": len(found), "left_out": len(left_out)}
     none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
     lines += [f"blur        {blur}"] if blur is not None and found else []
@@ -78,7 +80,7 @@ def find_masses(
         figures |= measure(f"mass{number}", mass, sigma, under)
         lines.append(f"mass{number}       {describe(mass, sigma, under)}")
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
-    return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn)
+    return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn, tuple(left_out))
 
 
 def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> Metrics:

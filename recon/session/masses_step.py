@@ -17,7 +17,7 @@ from recon.freehand.scans import Scans, ScansFields
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import Positive
-from recon.segmentation import containment, segmented_scans
+from recon.segmentation import containment, left_out, segmented_scans
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 from recon.session import volume_step
@@ -100,6 +100,8 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         for name, mesh in found.meshes.items():
             meshes.write_ply(folder / f"{name}.ply", mesh)
             meshes.write_glb(folder / f"{name}.glb", mesh)
+        if settings.kind == "masses":
+            left_out.write(folder / left_out.FILE, found.left_out)
         for number, image in enumerate(found.overlays):
             (folder / f"overlay{number}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
         metrics.write(folder / metrics.FILE, figures | found.figures | {"seconds_segment": round(perf_counter() - start, 3)})

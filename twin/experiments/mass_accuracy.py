@@ -70,7 +70,7 @@ def segmented(setup: Setup, seed: int) -> Sequence[Mass]:
     poses = poses_at(planned.track, planned.times, clocks.lag_s)
     calibration = sound_in_water.for_tissue(sweep_session.calibration_of(setup.rig, transducer), SOUND.tissue)
     world_from_pixel = poses @ sequences.target_from_pixel(calibration)
-    return masses.from_scans(lambda: iter(images), images.shape[1:], world_from_pixel, SOUND, blur=Blur())
+    return masses.from_scans(lambda: iter(images), images.shape[1:], world_from_pixel, SOUND, blur=Blur()).masses
 
 
 def measured_skin(setup: Setup) -> trimesh.Trimesh:

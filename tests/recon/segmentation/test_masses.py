@@ -9,9 +9,10 @@ from scipy.special import ndtr
 
 from recon.errors import InputError
 from recon.files.volumes import Volume
-from recon.segmentation import masses
+from recon.segmentation import masses, rough_bodies
 from recon.segmentation.echo_power import EchoPower
-from recon.segmentation.masses import refined, rough
+from recon.segmentation.masses import refined
+from recon.segmentation.rough_bodies import rough
 
 SPACING = np.array(masses.SPACING_MM)
 SIZE = (np.array([36, 36, 32]) / SPACING).astype(int)  # nx, ny, nz
@@ -40,7 +41,7 @@ def ball():
 
 
 def find(power):
-    return refined(rough(power), power, masses.REFINEMENTS[-1])
+    return refined(rough(power).masses, power, masses.REFINEMENTS[-1])
 
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
@@ -60,7 +61,7 @@ def test_a_body_larger_than_its_surroundings_count_is_no_hollow_one(rng):
     distance = step * np.linalg.norm(np.mgrid[-22:23, -22:23, -22:23], axis=0)
     mean = np.where(distance < radius, DARK, 1.0)
     voxels = (mean * rng.gamma(40, 1 / 40, mean.shape)).astype(np.float32)
-    (mass,) = rough(EchoPower(Volume(voxels, np.zeros(3), np.full(3, step)), np.full(mean.shape, 40, np.float32)))
+    (mass,) = rough(EchoPower(Volume(voxels, np.zeros(3), np.full(3, step)), np.full(mean.shape, 40, np.float32))).masses
     assert mass.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.05) and mass.mesh.body_count == 1
 
 
@@ -241,7 +242,7 @@ def test_a_shape_that_is_not_the_images_is_refused():
 def test_a_blur_is_a_gaussian_filter(rng, shape):
     """Another width along each axis, axes shorter than the kernel too."""
     field, sigma = rng.normal(size=shape).astype(np.float32), np.array([0.8, 2.3, 5.1])
-    np.testing.assert_allclose(masses._blurred(field, sigma), ndimage.gaussian_filter(field, sigma), atol=1e-6)
+    np.testing.assert_allclose(rough_bodies._blurred(field, sigma), ndimage.gaussian_filter(field, sigma), atol=1e-6)
 
 
 @pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.9, 0.4, 0.25), (4.0, 0.3, 0.5)])
@@ -251,4 +252,4 @@ def test_an_opening_is_one_by_distances(rng, spacing):
     core = ndimage.distance_transform_edt(mask, spacing) > 1.5
     assert 0 < core.sum() < mask.sum() < mask.size
     opened = mask & (ndimage.distance_transform_edt(~core, spacing) <= 1.75)
-    np.testing.assert_array_equal(masses._opened(mask, 1.5, np.array(spacing)), opened)
+    np.testing.assert_array_equal(rough_bodies._opened(mask, 1.5, np.array(spacing)), opened)

@@ -1,0 +1,385 @@
+"""Dark bodies in averaged echo power, roughly, and what is left out with its reason: cut by the scan, or hardly a mass."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon import threads
+from recon.geometry import rigid
+from recon.segmentation.echo_power import EchoPower
+from recon.segmentation.left_out import LeftOut, Reason
+from recon.segmentation.mass_surface import Mass, meshed
+
+log = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Part = tuple[slice, ...]  # of a volume, along z, y and x
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class MassLimits:
+    """When dark voxels count as a mass. Powers are shares of the tissue's around."""
+
+    smooth_mm: float = 0.6  # standard deviation; speckle cells are smaller
+    around_mm: float = 6.0  # standard deviation over which tissue's level is taken
+    dark: float = 0.35  # 4.6 dB below tissue
+    seed: float = 0.12  # above the power of a mass's core: 9 dB
+    rise: float = 4.0  # of power from the darkest on: behind is no longer the mass but its shadow
+    floor: float = 0.03  # of power, 15 dB below tissue: what is darker may be noise in fluid, which rises by any factor
+    grow_mm: float = 1.0  # from a rough body, within which its border is searched; the shadow behind begins there too
+    edge_mm: float = 0.5  # of what was scanned: bodies nearer to it are none
+    open_mm: float = 1.5  # radius: thinner parts are shadows of borders
+    least_mm3: float = 50.0
+    fine_mm: float = 0.8  # the former, of small bodies, whose borders have no lobes
+    small_mm3: float = 12.0  # least of small bodies; speckle has none
+    few: int = 3  # small ones, at most, beyond which they are taken for the tissue's own unevenness
+    streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
+    core: float = 0.6  # of a mass's extent: its darkest part
+    least_seen: float = 0.3  # of the core, by sound that came through other masses
+
+
+@dataclass(frozen=True)
+class CutBodyLimits:
+    """When dark voxels at a side or an end of the scan are named as a body that it cuts."""
+
+    least_mm3: float = 15.0  # of what is seen of it
+    least_mm: float = 2.5  # of it down the beam; speckle has no holes as deep
+    darkest: float = 0.1  # share that is as dark as a mass's core: of a small piece most lies within the blur of its border
+    same: float = 0.5  # share of it that is whole by itself
+    mostly: float = 0.6  # share of what was seen before it that shows tissue: elsewhere the probe doesn't touch
+    before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
+    behind: float = 0.5  # share of another body within its shadow, which can't be cleared
+
+
+@dataclass(frozen=True)
+class GapLimits:
+    """When what no B-scan shows, with B-scans on both sides, is named as a gap."""
+
+    widths_mm: tuple[float, float] = (3.5, 20.0)  # least, from which masses are cut in two, and most: beyond are strokes apart
+    height_mm: float = 6.0  # down the beam, at least: a hand that goes up and down leaves less at the images' lower end
+    least_mm3: float = 500.0  # lost B-scans leave thousands; turned planes leave less beside each other
+    named: int = 3  # at most, the largest
+
+
+LIMITS, CUT, GAP = MassLimits(), CutBodyLimits(), GapLimits()
+CUT_WAYS: dict[Reason, str] = {
+    "cut by a gap in the sweep": "scan there again",
+    "cut by the images' lower end": "set a greater depth",
+}
+"""on from what cuts a body, where another sweep beside isn't the way"""
+
+
+class Found(NamedTuple):
+    """Masses, and what is left out."""
+
+    masses: list[Mass]
+    left_out: list[LeftOut]
+
+
+class Candidate(NamedTuple):
+    """A dark body, in a part of the volume."""
+
+    part: Part
+    inside: Mask  # of that part
+    volume: float  # mm^3
+    core: float  # median of its power over the tissue's
+
+
+def rough(power: EchoPower) -> Found:
+    """Dark bodies with tissue all around, without the shadows that hang on to them.
+
+    Left out, and logged with their reasons, are bodies that the scan's side, end or a gap cuts, those behind them, streaks down
+    the beam, which may be shadows of borders, weak ones, and small ones where they are many.
+    """
+    spacing = power.volume.spacing[::-1]
+    gap, left_out = _gaps(power)
+    ratio, seen = _over_tissue(power)
+    dark = seen & (ratio < LIMITS.dark)
+    dark &= ~_risen(np.where(dark, ratio, np.inf))
+    bodies, touching = _bodies(_opened(dark, LIMITS.open_mm, spacing), ratio, seen, spacing)
+    large = [one for one in bodies if one.volume >= LIMITS.least_mm3]
+    fine, _ = _bodies(_opened(dark, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(bodies, dark.shape))
+    small = [one for one in fine if one.volume >= LIMITS.small_mm3 and one.core <= LIMITS.seed]
+    chosen = [one for one in large if one.core <= LIMITS.seed]
+    left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > LIMITS.seed]
+    if len(small) <= LIMITS.few:
+        chosen += small
+    else:
+        left_out += [_leave_out("small", one, power) for one in small]
+    cut, shadowed = _cut_bodies(dark, _mask(chosen, dark.shape), ratio, seen, gap, power)
+    left_out += cut
+    masses = list[Mass]()
+    for one in chosen:
+        height, thick = np.ptp(np.nonzero(one.inside)[1]) * spacing[1], _thickness(one.inside, spacing)
+        if height > LIMITS.streak * thick:
+            left_out.append(_leave_out("streak down the beam", one, power))
+        elif shadowed[one.part][one.inside].mean() > CUT.behind:
+            left_out.append(_leave_out("behind a cut body", one, power))
+        else:
+            field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), ratio[one.part], 1.0)
+            masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
+    return Found(masses, left_out)
+
+
+def _over_tissue(power: EchoPower) -> tuple[NDArray, Mask]:
+    """Power over that of the tissue around, smoothed over speckle, and where it is known; 1 elsewhere."""
+    spacing = power.volume.spacing[::-1]
+    smooth = _smooth(power.volume.voxels, power.weight, LIMITS.smooth_mm / spacing)
+    seen = np.isfinite(smooth)
+    tissue = np.minimum(power.volume.voxels, 2.0)
+    bright = seen.copy()
+    for _ in range(3):
+        level = _smooth(tissue, power.weight * bright, LIMITS.around_mm / spacing)
+        bright = seen & (smooth > LIMITS.dark * np.nan_to_num(level, nan=np.inf))
+    middles = _middles(seen & ~bright, spacing)
+    if middles.any() and (bright & ~middles).any():
+        hollow = middles & (smooth < LIMITS.dark * level[_nearest(bright & ~middles, spacing)])
+        level = _smooth(tissue, power.weight * (bright & ~hollow), LIMITS.around_mm / spacing)
+        level = np.where(hollow, level[_nearest(np.isfinite(level), spacing)], level)
+    return np.where(seen, smooth / level, 1.0), seen
+
+
+def _bodies(mask: Mask, ratio: NDArray, seen: Mask, spacing: Array, taken: Mask | None = None) -> tuple[list[Candidate], Mask]:
+    """Bodies of a mask with all of their border within the scan, and voxels of the others; none that meets what is taken."""
+    labels, count = ndimage.label(mask)
+    touching, candidates = np.zeros(mask.shape, bool), list[Candidate]()
+    margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * LIMITS.grow_mm, LIMITS.edge_mm))
+    boxes = ndimage.find_objects(labels)
+    for number in range(1, count + 1):
+        box = boxes[number - 1]
+        part = tuple(slice(max(0, s.start - m), s.stop + m) for s, m in zip(box, margin, strict=True))
+        inside = labels[part] == number
+        if taken is not None and (taken[part] & inside).any():
+            continue
+        ends = any(s.start < m or s.stop > n - m for s, m, n in zip(box, edge, mask.shape, strict=True))
+        if ends or (_widen(inside, LIMITS.edge_mm, spacing) & ~seen[part]).any():
+            touching[part] |= inside
+        else:
+            volume = inside.sum() * float(np.prod(spacing))
+            candidates.append(Candidate(part, inside, volume, float(np.median(ratio[part][inside]))))
+    return candidates, touching
+
+
+def _mask(bodies: Sequence[Candidate], shape: tuple[int, ...]) -> Mask:
+    """Voxels of bodies."""
+    mask = np.zeros(shape, bool)
+    for one in bodies:
+        mask[one.part] |= one.inside
+    return mask
+
+
+def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
+    """Leave out a body for a reason that is told of it."""
+    spacing = power.volume.spacing[::-1]
+    extents, centre = _extents(ndimage.find_objects(one.inside.astype(int))[0], spacing), _middle(one.inside, one.part, power)
+    place = f"{one.volume:.0f} mm3 at {_told(centre)} mm"
+    match reason:
+        case "streak down the beam":
+            text = f"a dark streak at {_told(centre)} mm, {extents[1]:.0f} mm down the beam and "
+            text += f"{_thickness(one.inside, spacing):.0f} mm thick, is left out: a shadow of a border, "
+            text += f"or a body longer down the beam than {LIMITS.streak:g} times its thickness"
+        case "behind a cut body":
+            text = f"a dark body of {place} is left out: it lies behind one that is cut, maybe its shadow"
+        case "weak contrast":
+            text = f"a body of {place} is left out: {-10 * np.log10(one.core):.0f} dB darker than the tissue around is weak"
+        case _:
+            text = f"a small dark body of {place} is left out: there are many like it, as in uneven tissue"
+    return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text).say()
+
+
+def _middles(dark: Mask, spacing: Array) -> Mask:
+    """Voxels with dark ones all around; none unless they are many, as in a body so large that its middle surrounds itself."""
+    labels, count = ndimage.label(~dark)
+    open_ = np.zeros(count + 1, bool)
+    open_[0] = True
+    for axis in range(3):
+        open_[labels.take([0, -1], axis)] = True
+    inner = ~open_[labels]
+    sizes = np.bincount(labels[inner], minlength=1) * float(np.prod(spacing))
+    return inner if sizes.max() >= LIMITS.least_mm3 else np.zeros_like(inner)
+
+
+def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
+    """Indices of the voxel of a mask that is nearest to each."""
+    return tuple(np.asarray(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True)))
+
+
+def _gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
+    """Voxels that no B-scan shows, with B-scans on both sides, where masses are missed; and the largest of these gaps."""
+    spacing, gaps, found = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool), list[LeftOut]()
+    tall = np.ones((1, int(np.ceil(GAP.height_mm / spacing[1])), 1), bool)
+    for axis, where in ((0, "in the sweep"), (2, "between strokes")):
+        width = _gap_widths(power.seen, axis, float(spacing[axis]))
+        width[gaps | (width > GAP.widths_mm[1])] = 0
+        gaps |= width > 0
+        labels, _ = ndimage.label(ndimage.binary_opening(width >= GAP.widths_mm[0], tall))
+        for one, part in enumerate(ndimage.find_objects(labels), start=1):
+            inside = labels[part] == one
+            if (volume := inside.sum() * float(np.prod(spacing))) >= GAP.least_mm3:
+                wide, centre = float(np.median(width[part][inside])), _middle(inside, part, power)
+                text = f"a gap of {wide:.1f} mm {where}, {volume:.0f} mm3 about {_told(centre)} mm, wasn't scanned: "
+                text += "masses in it may be missed"
+                extents = _extents(part, spacing)
+                found.append(LeftOut(reason="gap", volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text))
+    found.sort(key=lambda gap: -gap.volume_mm3)
+    for gap in found[: GAP.named]:
+        gap.say()
+    if others := found[GAP.named :]:
+        log.warning("%d smaller gaps, %.0f mm3 together, weren't scanned", len(others), sum(gap.volume_mm3 for gap in others))
+    return gaps, found
+
+
+def _gap_widths(seen: Mask, axis: int, step_mm: float) -> Map:
+    """Width, mm, along an axis of the run of unseen voxels that each is in; infinite at an end of the volume, 0 of seen ones."""
+    number = np.arange(seen.shape[axis], dtype=np.float32).reshape(np.where(np.arange(3) == axis, -1, 1))
+    width = np.where(seen, number, np.float32(np.inf))
+    width = np.flip(np.minimum.accumulate(np.flip(width, axis), axis), axis)  # the next that is seen
+    width -= np.maximum.accumulate(np.where(seen, number, np.float32(-np.inf)), axis)
+    width -= np.float32(1)
+    width *= np.float32(step_mm)
+    width[seen] = 0
+    return width
+
+
+def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, power: EchoPower) -> tuple[list[LeftOut], Mask]:
+    """Dark bodies behind tissue that a side, an end or a gap of the scan cuts, and voxels in their shadows.
+
+    Bodies that are whole are left out. The dark behind a phantom has a reason of its own: nothing bright is behind it, and it has
+    hardly a side.
+    """
+    spacing = power.volume.spacing[::-1]
+    pad = int(np.ceil(2 * LIMITS.open_mm / spacing.min()))
+    whole, known, gap = np.pad(whole, pad), np.pad(seen, pad), np.pad(gap, pad)
+    ratio = np.pad(ratio, pad, constant_values=1.0)
+    dark = np.pad(dark, pad)
+    bright = known & (ratio > LIMITS.dark)
+    last = ~np.logical_or.accumulate(bright[:, ::-1], axis=1)[:, ::-1]  # nothing behind is bright
+    labels, _ = ndimage.label(dark & _opened(dark | ~known, LIMITS.open_mm, spacing))
+    margin = np.ceil(4 * LIMITS.edge_mm / spacing).astype(int)
+    shadowed, left_out = np.zeros(dark.shape, bool), list[LeftOut]()
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        part = tuple(slice(s.start - m, s.stop + m) for s, m in zip(box, margin, strict=True))
+        inside, here = labels[part] == number, known[part]
+        volume = inside.sum() * float(np.prod(spacing))
+        along, height, across = extents = _extents(box, spacing)
+        small = volume < CUT.least_mm3 or height < CUT.least_mm or height > LIMITS.streak * max(along, across)
+        if small or np.quantile(ratio[part][inside], CUT.darkest) > LIMITS.seed or whole[part][inside].mean() > CUT.same:
+            continue
+        shell, behind = _widen(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
+        before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
+        beside, before = shell & ~behind & ~before, shell & before & inside.any(axis=1, keepdims=True)
+        unseen, front = shell & ~here, before & here
+        sides: dict[Reason, int] = {
+            "cut by the images' side": _fullest(unseen, 2),
+            "cut by the sweep's end": _fullest(unseen & ~gap[part], 0),
+            "cut by a gap in the sweep": _fullest(unseen & gap[part], 0),
+            "cut by the images' lower end": _fullest(unseen, 1),
+        }
+        covered = front.sum() > CUT.before * before.sum() and (front & bright[part]).sum() >= CUT.mostly * front.sum()
+        if not any(sides.values()) or not covered:
+            continue
+        ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
+        centre = _middle(inside, tuple(slice(s.start - pad, s.stop - pad) for s in part), power)
+        if ends and (beside & ~here).sum() > (1 - CUT.mostly) * beside.sum():
+            reason: Reason = "behind the tissue"
+            text = f"the dark behind the tissue, {volume:.0f} mm3 about {_told(centre)} mm, "
+            text += "holds no mass, or one that isn't told from it"
+        else:
+            reason = max(sides, key=lambda name: sides[name])
+            text = f"a dark body is {reason}, and is left out: {volume:.0f} mm3 of it at {_told(centre)} mm, "
+            text += f"{along:.0f} x {height:.0f} x {across:.0f} mm; {CUT_WAYS.get(reason, 'scan on there')}"
+        left_out.append(LeftOut(reason=reason, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text).say())
+        if reason == "behind the tissue":
+            continue
+        near = _widen(inside, 2 * LIMITS.grow_mm, spacing)
+        below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
+        shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
+    return left_out, shadowed[pad:-pad, pad:-pad, pad:-pad]
+
+
+def _fullest(unseen: Mask, axis: int) -> int:
+    """Greatest number of unseen voxels of a body's shell in one layer along an axis: what cuts it lies square to the greatest."""
+    return int(unseen.sum(axis=tuple(one for one in range(3) if one != axis)).max(initial=0))
+
+
+def _thickness(inside: Mask, spacing: Array) -> float:
+    """Diameter of the largest ball within a body, mm."""
+    return 2 * float(np.max(np.asarray(ndimage.distance_transform_edt(np.pad(inside, 1), spacing))))
+
+
+def _middle(inside: Mask, part: Part, power: EchoPower) -> Place:
+    """Middle, mm in the world, of a body in a part of a volume."""
+    voxel = np.array([np.mean(axis) + s.start for axis, s in zip(np.nonzero(inside), part, strict=True)][::-1])
+    x, y, z = rigid.apply(power.volume.world_from_voxel, voxel).tolist()
+    return x, y, z
+
+
+def _extents(part: Part, spacing: Array) -> Place:
+    """Extents, mm, along the array, down the beam and across, of a part of a volume with a spacing : (3,) z, y, x."""
+    across, deep, along = ((s.stop - s.start) * float(step) for s, step in zip(part, spacing, strict=True))
+    return along, deep, across
+
+
+def _told(centre: Place) -> str:
+    """A place for people."""
+    return ", ".join(f"{value:.0f}" for value in centre)
+
+
+def _risen(ratio: NDArray) -> Mask:
+    """Voxels behind a rise of power by `LIMITS.rise`, in each run of finite values down the beam (axis 1)."""
+    lowest, risen = np.full(ratio[:, 0].shape, np.inf), np.zeros(ratio[:, 0].shape, bool)
+    result = np.zeros(ratio.shape, bool)
+    for row in range(ratio.shape[1]):
+        here = ratio[:, row]
+        run = np.isfinite(here)
+        lowest = np.where(run, np.minimum(lowest, here), np.inf)
+        risen = run & (risen | (here > LIMITS.rise * np.maximum(lowest, LIMITS.floor)))
+        result[:, row] = risen
+    return result
+
+
+def _smooth(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
+    fields = (np.asarray(field, np.float32) for field in (weight, values * weight))
+    share, total = threads.mapped(lambda field: _blurred(field, sigma), fields)
+    return np.divide(total, share, out=np.full_like(total, np.nan), where=share > 0.02)
+
+
+def _blurred(field: Map, sigma: Array) -> Map:
+    """A Gaussian blur of (nz, ny, nx), reflected at the sides: as `scipy.ndimage.gaussian_filter`, by vector instructions."""
+    blur_reach = 4  # standard deviations to which a blur reaches
+    aside, down, across = (cv2.getGaussianKernel(2 * round(blur_reach * one) + 1, one, cv2.CV_32F) for one in sigma)
+    sheets = np.empty_like(field)
+    for sheet, blurred in zip(field, sheets, strict=True):
+        cv2.sepFilter2D(sheet, -1, across, down, dst=blurred, borderType=cv2.BORDER_REFLECT)
+    lines = sheets.reshape(len(field), -1)
+    return cv2.sepFilter2D(lines, -1, np.ones(1, np.float32), aside, borderType=cv2.BORDER_REFLECT).reshape(field.shape)
+
+
+def _opened(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
+    """The voxels of a mask that lie in balls which fit into it, or no more than half of the widest voxel away."""
+    core = ~_widen(~mask, radius_mm, spacing)
+    beside_mm = 0.25  # half of the widest voxel
+    return mask & _widen(core, radius_mm + beside_mm, spacing)
+
+
+def _widen(mask: Mask, radius_mm: float, spacing: Array) -> Mask:
+    """Voxels no farther than a radius from a mask's: a dilation by a ball, disc by disc."""
+    reach = np.floor(radius_mm / spacing).astype(int)
+    aside, down, across = (np.arange(-n, n + 1) * one for n, one in zip(reach, spacing, strict=True))
+    discs = (aside[:, None, None] ** 2 + down[:, None] ** 2 + across**2 <= radius_mm**2).astype(np.uint8)
+    sheets = mask.view(np.uint8)
+
+    def widen(k: int) -> Mask:
+        near = [(sheets[k + n - reach[0]], disc) for n, disc in enumerate(discs) if 0 <= k + n - reach[0] < len(mask)]
+        return np.max([cv2.dilate(sheet, disc) for sheet, disc in near if disc.any()], axis=0) > 0
+
+    return np.stack(list(threads.mapped(widen, range(len(mask)))))
