@@ -8,7 +8,7 @@ iteration. A second one moves depths by 0.03 mm, and they scatter more.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -73,9 +73,12 @@ class Planes:
 
 
 def corrected(masses: Sequence[Mass], power: EchoPower, planes: Planes, fit: Fit) -> list[Mass]:
-    """Masses without what blur and fit do to their surfaces; `power` is that in which they were found."""
+    """Masses without what blur and fit do to their surfaces; `power` is that in which they were found.
+
+    Bright ones are blurred as dark ones are.
+    """
     made = echoes(masses, grid_of(power.volume), planes)
-    again = fit(masses, EchoPower(made.volume, np.where(made.seen, power.weight, 0)))
+    again = fit([replace(mass, bright=False) for mass in masses], EchoPower(made.volume, np.where(made.seen, power.weight, 0)))
     return [_move(*both) for both in zip(masses, again, strict=True)]
 
 
@@ -83,7 +86,8 @@ def _move(found: Mass, again: Mass) -> Mass:
     """A mass less the difference between what is found of it again and itself."""
     vertices = np.asarray(found.mesh.vertices)
     off = signed_distances(vertices, again.mesh)
-    return Mass(trimesh.Trimesh(vertices + off[:, None] * found.mesh.vertex_normals, found.mesh.faces, process=False))
+    moved = trimesh.Trimesh(vertices + off[:, None] * found.mesh.vertex_normals, found.mesh.faces, process=False)
+    return replace(found, mesh=moved)
 
 
 def echoes(masses: Sequence[Mass], grid: Grid, planes: Planes) -> EchoPower:

@@ -43,8 +43,11 @@ class _Cells(NamedTuple):
     start: NDArray[np.int64]  # (nx, ny, nz + 1) number of the first place in a cube; the last ends the row
 
 
-def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM) -> trimesh.Trimesh:
-    """Move the vertices of a closed mesh along their normals to the border in the power."""
+def refine(rough: trimesh.Trimesh, power: EchoPower, bright: bool = False, patch_mm: float = PATCH_MM) -> trimesh.Trimesh:
+    """Move the vertices of a closed mesh along their normals to the border in the power.
+
+    bright : whether power steps down to the outside, and not up.
+    """
     number, distance, value, weight = _near(rough, power)
     bins = round(2 * REACH_MM / BIN_MM)
     index = number * bins + np.clip(((distance + REACH_MM) / BIN_MM).astype(int), 0, bins - 1)
@@ -54,7 +57,7 @@ def refine(rough: trimesh.Trimesh, power: EchoPower, patch_mm: float = PATCH_MM)
     vertices, normals = np.asarray(rough.vertices), np.asarray(rough.vertex_normals)
     mixed = mix(vertices, normals, np.hstack([mass, total]), patch_mm)
     mass, total = mixed[:, :bins], mixed[:, bins:]
-    step, doubt = _steps(np.divide(total, mass, out=np.zeros_like(total), where=mass > 0), mass)
+    step, doubt = _steps(np.divide(total, mass, out=np.zeros_like(total), where=mass > 0), mass, bright)
     sure, pull = mix(vertices, normals, np.column_stack([1 / doubt, step / doubt]), patch_mm).T
     stay = 0.1  # of the median certainty: weight of the place before
     moved = pull / (sure + stay * np.median(sure))  # uncertain vertices stay
@@ -150,8 +153,8 @@ def _near(rough: trimesh.Trimesh, power: EchoPower) -> tuple[NDArray[np.int64], 
     )
 
 
-def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
-    """Places : (n,) mm at which profiles : (n, bins) step up, and a variance in some unit.
+def _steps(profiles: Array, weight: Array, down: bool = False) -> tuple[Array, Array]:
+    """Places : (n,) mm at which profiles : (n, bins) step up, or down, and a variance in some unit.
 
     Where none is found, or the least misfit lies beside places at which nothing fits, as in noise alone, the variance is `NEVER`.
 
@@ -168,7 +171,9 @@ def _steps(profiles: Array, weight: Array) -> tuple[Array, Array]:
     blurs_mm = (0.25, 0.4, 0.6)  # trial standard deviations; with a narrower one more steps are found beside lines
     z = (s - candidates[:, None, None]) / np.array(blurs_mm)[:, None]
     trials = np.stack([ndtr(z), ndtr(-z), np.exp(-z * z / 2)], axis=2)  # (places, blurs, 3, bins)
-    plain, lined = misfits(profiles, weight, trials)
+    plain, lined = misfits(-profiles if down else profiles, weight, trials)
+    if down:
+        lined = np.full_like(plain, NEVER)  # a bright body's border has no dark line
     unlike = 0.05  # of tissue's power, by which blurs differ from those tried
     least = unlike**2 * weight.sum(axis=1)
     line_gain = 1.5  # by which the misfit must be less with a line on the border

@@ -19,6 +19,7 @@ Reason = Literal[
     "cut by the images' side",
     "cut by the images' lower end",
     "cut by a gap in the sweep",
+    "cut by the ringing at the face",
     "behind a cut body",
     "streak down the beam",
     "weak contrast",

@@ -1,7 +1,7 @@
 """Closed surfaces of masses: signed distances to them, and surfaces without folds from these."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -10,6 +10,8 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 from skimage.measure import marching_cubes
+from skimage.morphology import local_maxima, reconstruction
+from skimage.segmentation import watershed
 
 from recon import threads
 from recon.files.volumes import Volume
@@ -28,6 +30,8 @@ class Mass:
     """A mass in the world."""
 
     mesh: trimesh.Trimesh  # closed, mm
+    bright: bool = False  # whether it echoes more than the tissue around
+    beside: bool = False  # whether it touches another one, from which it was parted at the waist of both: perhaps they are one
 
     @property
     def volume(self) -> float:
@@ -55,7 +59,31 @@ def evened(mass: Mass, axes: Array) -> Mass:
     for _ in range(levellings):
         mesh = meshed(field, level, whole, near, outside=FAR_MM)
         level += (volume - _enclosed(np.asarray(mesh.vertices), mesh.faces).sum()) / mesh.area
-    return Mass(meshed(field, level, whole, near, outside=FAR_MM))
+    return replace(mass, mesh=meshed(field, level, whole, near, outside=FAR_MM))
+
+
+def parted(mass: Mass, axes: Array) -> list[Mass]:
+    """The bodies of a mass that meet in a waist, largest first, or the mass itself.
+
+    Two bodies are those with middles of their own: places that lie deeper below the surface, by `waist_mm` or more, than all ways
+    from one to the other, and whose waist is narrower than the thinner one by `narrower`. Masses of one form, be it lobulated or
+    spiculated, have no such waist.
+    """
+    waist_mm, narrower, least_mm3, mesh_mm = 0.6, 0.85, 50.0, 0.3
+    near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, mesh_mm), NEAR_MM))
+    inside = near.voxels < 0
+    deep = np.asarray(ndimage.distance_transform_edt(inside)) * mesh_mm
+    middles, count = ndimage.label(local_maxima(reconstruction(np.maximum(deep - waist_mm, 0), deep)))
+    if count < 2:
+        return [mass]
+    bodies, numbers, whole = watershed(-deep, middles, mask=inside), range(1, count + 1), 3 * (slice(0, None),)
+    beside = np.array([deep[ndimage.binary_dilation(bodies == k) & (bodies > 0) & (bodies != k)].max() for k in numbers])
+    volumes = np.bincount(bodies.ravel())[1:] * mesh_mm**3
+    if (beside > narrower * ndimage.maximum(deep, bodies, numbers)).any() or volumes.min() < least_mm3:
+        return [mass]
+    fields = (np.where((bodies == 0) | (bodies == k), near.voxels, mesh_mm / 2) for k in numbers)
+    parts = [replace(mass, mesh=meshed(field, 0.0, whole, near, outside=FAR_MM), beside=True) for field in fields]
+    return sorted(parts, key=lambda one: -one.volume)
 
 
 def _around(mass: Mass, lattice: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

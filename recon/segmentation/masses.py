@@ -1,6 +1,7 @@
-"""Masses darker than the tissue around them, in tracked B-scans: each a closed surface in the world."""
+"""Masses darker or brighter than the tissue around them, in tracked B-scans: each a closed surface in the world."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,10 +14,10 @@ from recon.geometry import rigid
 from recon.segmentation import blur_correction, border_fit, echo_power
 from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
-from recon.segmentation.left_out import LeftOut
-from recon.segmentation.mass_surface import Mass, distances, evened
+from recon.segmentation.left_out import LeftOut, Reason
+from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
-from recon.segmentation.rough_bodies import LIMITS, Found, rough
+from recon.segmentation.rough_bodies import LIMITS, Found, faint, rough
 from recon.segmentation.shadow_clearing import Recording, cleared
 
 Array = NDArray[np.float64]
@@ -75,16 +76,24 @@ def from_scans(
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
-    masses, left_out = rough(power)
-    masses = refined(masses, power, roughly)
+    first = rough(power)
+    masses, left_out = refined(first.masses, power, roughly), first.left_out
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
             left_out += [_shadow(mass) for mass in masses if not _is_dark(mass, power)]
             masses = refined([mass for mass in masses if _is_dark(mass, power)], power, times)
+    more = faint(power, masses, first.hidden) if first.even else Found([], [])
+    left_out += more.left_out
+    if more.masses:
+        power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
+        sure = refined(more.masses, power, sum(REFINEMENTS))
+        left_out += [_faint(mass) for mass in sure if not _stands_out(mass, power)]
+        masses += [mass for mass in sure if _stands_out(mass, power)]
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
+    masses = [part for mass in masses for part in parted(mass, power.volume.directions)]
     return Found(sorted(masses, key=lambda mass: -mass.volume), left_out)
 
 
@@ -121,22 +130,46 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
 
 def _is_dark(mass: Mass, power: EchoPower) -> bool:
     """Whether a mass is still dark after the shadows of others have been taken away."""
-    places = mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre)
+    values = _sampled(power, mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre))
+    seen = np.isfinite(values)
+    return bool(seen.mean() > LIMITS.least_seen and np.median(values[seen]) < LIMITS.still)
+
+
+def _stands_out(mass: Mass, power: EchoPower) -> bool:
+    """Whether a mass differs from the tissue on all its sides, by half of what it does as a whole."""
+    beside_mm = (1.0, 1.5, 2.0, 2.5)  # of its border
+    vertices, away = np.asarray(mass.mesh.vertices), np.asarray(mass.mesh.vertex_normals)
+    outside, inside = ([_sampled(power, vertices + side * mm * away) for mm in beside_mm] for side in (1, -1))
+    sides = (away > 0) @ [1, 2, 4]  # octants
+    steps = [np.nanmean(np.array(outside)[:, sides == k]) - np.nanmean(np.array(inside)[:, sides == k]) for k in np.unique(sides)]
+    whole = float(np.nanmean(outside) - np.nanmean(inside))
+    return (whole < 0) == mass.bright and bool(np.nanmin(np.array(steps) / whole) > 0.5)
+
+
+def _sampled(power: EchoPower, places: Array) -> Array:
+    """Power : (n,) at places : (n, 3); NaN where nothing is seen."""
     voxel = np.rint(rigid.apply(np.linalg.inv(power.volume.world_from_voxel), places)).astype(int)
-    i, j, k = np.clip(voxel, 0, np.array(power.weight.shape[::-1]) - 1).T
-    seen = power.weight[k, j, i] > 0
-    return bool(seen.mean() > LIMITS.least_seen and np.median(power.volume.voxels[k, j, i][seen]) < LIMITS.dark)
+    size = np.array(power.weight.shape[::-1])
+    i, j, k = np.clip(voxel, 0, size - 1).T
+    there = (power.weight[k, j, i] > 0) & ((voxel >= 0) & (voxel < size)).all(axis=1)
+    return np.where(there, power.volume.voxels[k, j, i], np.nan)
 
 
 def _shadow(mass: Mass) -> LeftOut:
     """Leave out what isn't dark any more."""
+    return _left_out("shadow of a mass", mass, "masses before it shadow it")
+
+
+def _faint(mass: Mass) -> LeftOut:
+    """Leave out what has no border all around."""
+    return _left_out("weak contrast", mass, "it hardly differs from the tissue around")
+
+
+def _left_out(reason: Reason, mass: Mass, why: str) -> LeftOut:
     (x, y, z), (along, down, across) = mass.centre.tolist(), mass.mesh.extents.tolist()
-    text = (
-        f"a dark body of {mass.volume:.0f} mm3 at {x:.0f}, {y:.0f}, {z:.0f} mm is left out: it is the shadow of masses before it"
-    )
-    return LeftOut(
-        reason="shadow of a mass", volume_mm3=mass.volume, centre_mm=(x, y, z), extents_mm=(along, down, across), text=text
-    ).say()
+    kind, extents = "bright" if mass.bright else "dark", (along, down, across)
+    text = f"a {kind} body of {mass.volume:.0f} mm3 at {x:.0f}, {y:.0f}, {z:.0f} mm is left out: {why}"
+    return LeftOut(reason=reason, volume_mm3=mass.volume, centre_mm=(x, y, z), extents_mm=extents, text=text).say()
 
 
 def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int], sound: Sound) -> Iterator[Mask]:
@@ -155,7 +188,7 @@ def refined(masses: Sequence[Mass], power: EchoPower, times: int) -> list[Mass]:
 
     def refine(mass: Mass) -> Mass:
         for _ in range(times):
-            mass = evened(Mass(border_fit.refine(mass.mesh, power)), power.volume.directions)
+            mass = evened(replace(mass, mesh=border_fit.refine(mass.mesh, power, mass.bright)), power.volume.directions)
         return mass
 
     return list(threads.mapped(refine, masses, most=len(masses)))

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon import threads
+from recon.freehand.volume_compounding import grid_of
 from recon.geometry import rigid
 from recon.segmentation.echo_power import EchoPower
 from recon.segmentation.left_out import LeftOut, Reason
-from recon.segmentation.mass_surface import Mass, meshed
+from recon.segmentation.mass_surface import Mass, distances, meshed
 
 log = logging.getLogger(__name__)
 
@@ -39,11 +40,12 @@ class MassLimits:
     edge_mm: float = 0.5  # of what was scanned: bodies nearer to it are none
     open_mm: float = 1.5  # radius: thinner parts are shadows of borders
     least_mm3: float = 50.0
-    fine_mm: float = 0.8  # the former, of small bodies, whose borders have no lobes
-    small_mm3: float = 12.0  # least of small bodies; speckle has none
+    fine_mm: float = 0.6  # the former, of small bodies, whose borders have no lobes
+    small_mm3: float = 6.0  # least of what is seen of small bodies; speckle has none
     few: int = 3  # small ones, at most, beyond which they are taken for the tissue's own unevenness
     streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
     core: float = 0.6  # of a mass's extent: its darkest part
+    still: float = 0.5  # of power in its core at most, after the shadows of others are cleared
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 
 
@@ -57,6 +59,7 @@ class CutBodyLimits:
     same: float = 0.5  # share of it that is whole by itself
     mostly: float = 0.6  # share of what was seen before it that shows tissue: elsewhere the probe doesn't touch
     before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
+    around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
@@ -70,10 +73,29 @@ class GapLimits:
     named: int = 3  # at most, the largest
 
 
-LIMITS, CUT, GAP = MassLimits(), CutBodyLimits(), GapLimits()
+@dataclass(frozen=True)
+class FaintLimits:
+    """When voxels that are little darker than the tissue around, or brighter, count as a mass: in even tissue only.
+
+    Tissue that varies by itself, as a breast does, holds bodies of its own that none of these are told from.
+    """
+
+    even_db: float = 1.5  # of tissue that is even: speckle of silicone leaves 0.8, lobules of fat and gland make 3.4 and more
+    seed: float = 0.33  # in even tissue, above the power of a dark body's core
+    dark: float = 0.5  # there, of a small body's power: speckle blurs its core
+    smooth_mm: float = 1.0  # standard deviation: over five times the voxels of a dark body's, as the contrast is less
+    brightest: float = 4.0  # of power over the tissue's: brighter voxels count as this in its level
+    least_db: float = 2.4  # of contrast, at least
+    core_db: float = 2.8  # of contrast in its middle
+    beside_mm: float = 2.0  # of masses, where shadows and borders are left over
+    least_mm3: float = 80.0
+
+
+LIMITS, CUT, GAP, FAINT = MassLimits(), CutBodyLimits(), GapLimits(), FaintLimits()
 CUT_WAYS: dict[Reason, str] = {
     "cut by a gap in the sweep": "scan there again",
     "cut by the images' lower end": "set a greater depth",
+    "cut by the ringing at the face": "scan there through more gel",
 }
 """on from what cuts a body, where another sweep beside isn't the way"""
 
@@ -94,7 +116,16 @@ class Candidate(NamedTuple):
     core: float  # median of its power over the tissue's
 
 
-def rough(power: EchoPower) -> Found:
+class Rough(NamedTuple):
+    """What a first search finds."""
+
+    masses: list[Mass]
+    left_out: list[LeftOut]
+    even: bool  # whether the tissue is even enough for faint ones
+    hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones
+
+
+def rough(power: EchoPower) -> Rough:
     """Dark bodies with tissue all around, without the shadows that hang on to them.
 
     Left out, and logged with their reasons, are bodies that the scan's side, end or a gap cuts, those behind them, streaks down
@@ -104,14 +135,17 @@ def rough(power: EchoPower) -> Found:
     gap, left_out = _gaps(power)
     ratio, seen = _over_tissue(power)
     dark = seen & (ratio < LIMITS.dark)
+    even = _unevenness(ratio, seen & ~_widen(dark, FAINT.beside_mm, spacing)) < FAINT.even_db
     dark &= ~_risen(np.where(dark, ratio, np.inf))
+    seed = FAINT.seed if even else LIMITS.seed
     bodies, touching = _bodies(_opened(dark, LIMITS.open_mm, spacing), ratio, seen, spacing)
     large = [one for one in bodies if one.volume >= LIMITS.least_mm3]
-    fine, _ = _bodies(_opened(dark, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(bodies, dark.shape))
-    small = [one for one in fine if one.volume >= LIMITS.small_mm3 and one.core <= LIMITS.seed]
-    chosen = [one for one in large if one.core <= LIMITS.seed]
-    left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > LIMITS.seed]
-    if len(small) <= LIMITS.few:
+    dim = dark | (seen & even & (ratio < FAINT.dark))
+    fine, _ = _bodies(_opened(dim, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(bodies, dark.shape))
+    small = [one for one in fine if one.volume >= LIMITS.small_mm3 and ratio[one.part][one.inside].min() <= seed]
+    chosen = [one for one in large if one.core <= seed]
+    left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
+    if even or len(small) <= LIMITS.few:
         chosen += small
     else:
         left_out += [_leave_out("small", one, power) for one in small]
@@ -127,7 +161,46 @@ def rough(power: EchoPower) -> Found:
         else:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), ratio[one.part], 1.0)
             masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
-    return Found(masses, left_out)
+    return Rough(masses, left_out, even, shadowed | (dark & ~_mask(chosen, dark.shape)))
+
+
+def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
+    """Bodies little darker than even tissue around, or brighter, in power without the shadows of the masses that are known.
+
+    hidden : voxels where none are looked for, as of `rough`
+    """
+    spacing, volume, seen = power.volume.spacing[::-1], power.volume, power.weight > 0
+    known = seen & ~hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
+    smooth = _smooth(volume.voxels, power.weight * known, FAINT.smooth_mm / spacing)
+    known &= np.isfinite(smooth)
+    contrast, even = np.zeros(seen.shape, np.float32), known
+    for _ in range(3):
+        level = _smooth(np.minimum(volume.voxels, FAINT.brightest), power.weight * even, LIMITS.around_mm / spacing)
+        told = known & (level > 0)
+        contrast[told] = 10 * np.log10(np.maximum(smooth[told] / level[told], 1e-6))
+        even = told & (np.abs(contrast) < FAINT.least_db)
+    found, left_out = list[Mass](), list[LeftOut]()
+    for sign in (-1, 1):
+        bodies, _ = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
+        bodies = [one for one in bodies if one.volume >= FAINT.least_mm3 and abs(one.core) >= FAINT.core_db]
+        for one in bodies:
+            field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), -sign * contrast[one.part], 0.0)
+            if np.ptp(np.nonzero(one.inside)[1]) * spacing[1] > LIMITS.streak * _thickness(one.inside, spacing):
+                left_out.append(_leave_out("streak down the beam", one, power))
+            elif any(_in_line(one, other) for other in bodies if other is not one):
+                left_out.append(_leave_out("weak contrast", one, power))
+            else:
+                found.append(Mass(meshed(field, -abs(one.core) / 2, one.part, volume, outside=0.0), bright=sign > 0))
+    return Found(found, left_out)
+
+
+def _in_line(one: Candidate, other: Candidate) -> bool:
+    """Whether the less wide one of two bodies lies mostly before or behind the other: one of them may be the other's shadow."""
+    first, second = (
+        {(int(k), int(i)) for k, i in np.argwhere(b.inside.any(axis=1)) + np.array([b.part[0].start, b.part[2].start])}
+        for b in (one, other)
+    )
+    return len(first & second) > CUT.behind * min(len(first), len(second))
 
 
 def _over_tissue(power: EchoPower) -> tuple[NDArray, Mask]:
@@ -146,6 +219,11 @@ def _over_tissue(power: EchoPower) -> tuple[NDArray, Mask]:
         level = _smooth(tissue, power.weight * (bright & ~hollow), LIMITS.around_mm / spacing)
         level = np.where(hollow, level[_nearest(np.isfinite(level), spacing)], level)
     return np.where(seen, smooth / level, 1.0), seen
+
+
+def _unevenness(ratio: NDArray, where: Mask) -> float:
+    """Standard deviation, dB, of the tissue's power, robust against bodies in it; infinite without tissue."""
+    return 1.4826 * float(np.median(np.abs(10 * np.log10(np.maximum(ratio[where], 1e-6))))) if where.any() else np.inf
 
 
 def _bodies(mask: Mask, ratio: NDArray, seen: Mask, spacing: Array, taken: Mask | None = None) -> tuple[list[Candidate], Mask]:
@@ -184,13 +262,13 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
     place = f"{one.volume:.0f} mm3 at {_told(centre)} mm"
     match reason:
         case "streak down the beam":
-            text = f"a dark streak at {_told(centre)} mm, {extents[1]:.0f} mm down the beam and "
+            text = f"a streak at {_told(centre)} mm, {extents[1]:.0f} mm down the beam and "
             text += f"{_thickness(one.inside, spacing):.0f} mm thick, is left out: a shadow of a border, "
             text += f"or a body longer down the beam than {LIMITS.streak:g} times its thickness"
         case "behind a cut body":
             text = f"a dark body of {place} is left out: it lies behind one that is cut, maybe its shadow"
         case "weak contrast":
-            text = f"a body of {place} is left out: {-10 * np.log10(one.core):.0f} dB darker than the tissue around is weak"
+            text = f"a body of {place} is left out: its contrast is weak"
         case _:
             text = f"a small dark body of {place} is left out: there are many like it, as in uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text).say()
@@ -284,7 +362,10 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
             "cut by a gap in the sweep": _fullest(unseen & gap[part], 0),
             "cut by the images' lower end": _fullest(unseen, 1),
         }
-        covered = front.sum() > CUT.before * before.sum() and (front & bright[part]).sum() >= CUT.mostly * front.sum()
+        above = front.sum() <= CUT.before * before.sum() and (beside & bright[part]).sum() > CUT.around * beside.sum()
+        if above:
+            sides = {"cut by the ringing at the face": 1}
+        covered = above or (front.sum() > CUT.before * before.sum() and (front & bright[part]).sum() >= CUT.mostly * front.sum())
         if not any(sides.values()) or not covered:
             continue
         ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
