@@ -20,6 +20,7 @@ Reason = Literal[
     "cut by the images' lower end",
     "cut by a gap in the sweep",
     "cut by the ringing at the face",
+    "its shadow hides its back",
     "behind a cut body",
     "streak down the beam",
     "weak contrast",

@@ -18,7 +18,7 @@ from recon.segmentation.left_out import LeftOut, Reason
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
 from recon.segmentation.rough_bodies import LIMITS, Found, faint, rough
-from recon.segmentation.shadow_clearing import Recording, cleared
+from recon.segmentation.shadow_clearing import Recording, cleared, passed
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -87,9 +87,20 @@ def from_scans(
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
+        left_out += [_shadow(mass) for mass in masses if not _is_dark(mass, power)]
+        masses = [mass for mass in masses if _is_dark(mass, power)]
         sure = refined(more.masses, power, sum(REFINEMENTS))
         left_out += [_faint(mass) for mass in sure if not _stands_out(mass, power)]
         masses += [mass for mass in sure if _stands_out(mass, power)]
+    kept = list[Mass]()
+    for mass in masses:
+        if passed(recording, grid, mass, sound) < LIMITS.passed:
+            left_out.append(_left_out("its shadow hides its back", mass, "all behind it is dark, so its back isn't seen"))
+        elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
+            left_out.append(_left_out("weak contrast", mass, "it may be the shadow of another, or that one its"))
+        else:
+            kept.append(mass)
+    masses = kept
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
@@ -130,7 +141,7 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
 
 def _is_dark(mass: Mass, power: EchoPower) -> bool:
     """Whether a mass is still dark after the shadows of others have been taken away."""
-    values = _sampled(power, mass.centre + LIMITS.core * (mass.mesh.vertices - mass.centre))
+    values = _sampled(power, _core(mass))
     seen = np.isfinite(values)
     return bool(seen.mean() > LIMITS.least_seen and np.median(values[seen]) < LIMITS.still)
 
@@ -144,6 +155,22 @@ def _stands_out(mass: Mass, power: EchoPower) -> bool:
     steps = [np.nanmean(np.array(outside)[:, sides == k]) - np.nanmean(np.array(inside)[:, sides == k]) for k in np.unique(sides)]
     whole = float(np.nanmean(outside) - np.nanmean(inside))
     return (whole < 0) == mass.bright and bool(np.nanmin(np.array(steps) / whole) > 0.5)
+
+
+def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:
+    """Whether a dark mass begins close behind another of weak contrast, so that it may be its shadow."""
+    array, beam, across = power.volume.directions.T
+    near_mm, away = 4.0, other.centre - mass.centre
+    own, its = (np.asarray(one.mesh.vertices) - one.centre for one in (mass, other))
+    gap = float(away @ beam + (its @ beam).min() - (own @ beam).max())
+    aside, size = (np.abs(one @ np.column_stack([array, across])) for one in (away, own))
+    weak = not mass.bright and not other.bright and np.nanmedian(_sampled(power, _core(mass))) > LIMITS.seed
+    return bool(weak and away @ beam > 0 and gap < near_mm and (aside < size.max(axis=0)).all())
+
+
+def _core(mass: Mass) -> Array:
+    """Places : (n, 3) mm in a mass's middle."""
+    return mass.centre + LIMITS.core * (np.asarray(mass.mesh.vertices) - mass.centre)
 
 
 def _sampled(power: EchoPower, places: Array) -> Array:

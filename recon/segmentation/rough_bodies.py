@@ -46,6 +46,7 @@ class MassLimits:
     streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
     core: float = 0.6  # of a mass's extent: its darkest part
     still: float = 0.5  # of power in its core at most, after the shadows of others are cleared
+    passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 
 
@@ -60,6 +61,7 @@ class CutBodyLimits:
     mostly: float = 0.6  # share of what was seen before it that shows tissue: elsewhere the probe doesn't touch
     before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
     around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
+    bump_mm: float = 6.0  # by which the dark behind the tissue begins before its median, over as wide a place: a body's shadow
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
@@ -89,6 +91,8 @@ class FaintLimits:
     core_db: float = 2.8  # of contrast in its middle
     beside_mm: float = 2.0  # of masses, where shadows and borders are left over
     least_mm3: float = 80.0
+    behind: float = 0.5  # share of tissue in what lies behind it: else it may be what the tissue lies on
+    behind_mm: float = 5.0  # of that
 
 
 LIMITS, CUT, GAP, FAINT = MassLimits(), CutBodyLimits(), GapLimits(), FaintLimits()
@@ -143,6 +147,9 @@ def rough(power: EchoPower) -> Rough:
     dim = dark | (seen & even & (ratio < FAINT.dark))
     fine, _ = _bodies(_opened(dim, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(bodies, dark.shape))
     small = [one for one in fine if one.volume >= LIMITS.small_mm3 and ratio[one.part][one.inside].min() <= seed]
+    if even:
+        spots, _ = _bodies(dim, ratio, seen, spacing, taken=touching | _mask([*bodies, *small], dark.shape))
+        left_out += [_leave_out("small", one, power) for one in spots if ratio[one.part][one.inside].min() <= seed]
     chosen = [one for one in large if one.core <= seed]
     left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
     if even or len(small) <= LIMITS.few:
@@ -179,6 +186,7 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
         told = known & (level > 0)
         contrast[told] = 10 * np.log10(np.maximum(smooth[told] / level[told], 1e-6))
         even = told & (np.abs(contrast) < FAINT.least_db)
+    plain = known & (np.abs(contrast) < FAINT.least_db)
     found, left_out = list[Mass](), list[LeftOut]()
     for sign in (-1, 1):
         bodies, _ = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
@@ -189,9 +197,23 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
                 left_out.append(_leave_out("streak down the beam", one, power))
             elif any(_in_line(one, other) for other in bodies if other is not one):
                 left_out.append(_leave_out("weak contrast", one, power))
+            elif _tissue_behind(one, plain, spacing) < FAINT.behind:
+                left_out.append(_leave_out("behind the tissue", one, power))
             else:
                 found.append(Mass(meshed(field, -abs(one.core) / 2, one.part, volume, outside=0.0), bright=sign > 0))
     return Found(found, left_out)
+
+
+def _tissue_behind(one: Candidate, plain: Mask, spacing: Array) -> float:
+    """Share of plain tissue in what lies just behind a body."""
+    deep = round(FAINT.behind_mm / float(spacing[1]))
+    below = np.zeros((*one.inside.shape[::2], deep), bool)
+    last = one.part[1].start + one.inside.shape[1] - 1 - one.inside[:, ::-1].argmax(axis=1)  # row of each column's end
+    part = plain[one.part[0], :, one.part[2]]
+    for row in range(deep):
+        rows = np.minimum(last + 1 + row, part.shape[1] - 1)
+        below[..., row] = np.take_along_axis(part, rows[:, None], axis=1)[:, 0]
+    return float(below.mean(axis=2)[one.inside.any(axis=1)].mean())
 
 
 def _in_line(one: Candidate, other: Candidate) -> bool:
@@ -258,19 +280,23 @@ def _mask(bodies: Sequence[Candidate], shape: tuple[int, ...]) -> Mask:
 def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
     """Leave out a body for a reason that is told of it."""
     spacing = power.volume.spacing[::-1]
+    thick = _thickness(one.inside, spacing)
     extents, centre = _extents(ndimage.find_objects(one.inside.astype(int))[0], spacing), _middle(one.inside, one.part, power)
     place = f"{one.volume:.0f} mm3 at {_told(centre)} mm"
     match reason:
         case "streak down the beam":
-            text = f"a streak at {_told(centre)} mm, {extents[1]:.0f} mm down the beam and "
-            text += f"{_thickness(one.inside, spacing):.0f} mm thick, is left out: a shadow of a border, "
+            centre = _middle(one.inside & (np.cumsum(one.inside.any(axis=(0, 2))) * spacing[1] < thick)[:, None], one.part, power)
+            text = f"a streak from {_told(centre)} mm on, {extents[1]:.0f} mm down the beam and "
+            text += f"{thick:.0f} mm thick, is left out: a shadow of a border, "
             text += f"or a body longer down the beam than {LIMITS.streak:g} times its thickness"
         case "behind a cut body":
             text = f"a dark body of {place} is left out: it lies behind one that is cut, maybe its shadow"
         case "weak contrast":
             text = f"a body of {place} is left out: its contrast is weak"
+        case "behind the tissue":
+            text = f"a body of {place} is left out: no tissue is seen behind it, so it may be what the tissue lies on"
         case _:
-            text = f"a small dark body of {place} is left out: there are many like it, as in uneven tissue"
+            text = f"a dark body of {place} is left out: it is too small to be measured, or told from uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text).say()
 
 
@@ -369,7 +395,8 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         if not any(sides.values()) or not covered:
             continue
         ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
-        centre = _middle(inside, tuple(slice(s.start - pad, s.stop - pad) for s in part), power)
+        middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
+        centre = _middle(inside, middle, power)
         if ends and (beside & ~here).sum() > (1 - CUT.mostly) * beside.sum():
             reason: Reason = "behind the tissue"
             text = f"the dark behind the tissue, {volume:.0f} mm3 about {_told(centre)} mm, "
@@ -380,11 +407,35 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
             text += f"{along:.0f} x {height:.0f} x {across:.0f} mm; {CUT_WAYS.get(reason, 'scan on there')}"
         left_out.append(LeftOut(reason=reason, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text).say())
         if reason == "behind the tissue":
+            left_out += _bumps(inside, middle, power)
             continue
         near = _widen(inside, 2 * LIMITS.grow_mm, spacing)
         below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
         shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
     return left_out, shadowed[pad:-pad, pad:-pad, pad:-pad]
+
+
+def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
+    """Bodies whose shadows reach the dark behind the tissue, in a part of the volume: where that begins before its median."""
+    spacing, columns, found = power.volume.spacing[::-1], behind.any(axis=1), list[LeftOut]()
+    front = np.where(columns, behind.argmax(axis=1), 0).astype(float) * spacing[1]
+    labels, _ = ndimage.label(columns & (front < np.median(front[columns]) - CUT.bump_mm))
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        wide = labels[box] == number
+        across, along = ((s.stop - s.start) * float(step) for s, step in zip(box, spacing[::2], strict=True))
+        if wide.sum() * spacing[0] * spacing[2] < CUT.bump_mm**2:
+            continue
+        k, i = np.nonzero(labels == number)
+        row = (float(front[k, i].min()) + min(across, along) / 2) / spacing[1]
+        places = np.array([i.mean() + part[2].start, row + part[1].start, k.mean() + part[0].start])
+        x, y, z = rigid.apply(power.volume.world_from_voxel, places).tolist()
+        deep = float(np.median(front[columns]) - front[k, i].min())
+        text = f"a dark body at {x:.0f}, {y:.0f}, {z:.0f} mm, {along:.0f} x {across:.0f} mm wide, is left out: "
+        text += "its shadow reaches the dark behind the tissue, so its back isn't seen"
+        extents, volume = (along, deep, across), float(behind[k, :, i].sum() * np.prod(spacing))
+        why: Reason = "its shadow hides its back"
+        found.append(LeftOut(reason=why, volume_mm3=volume, centre_mm=(x, y, z), extents_mm=extents, text=text).say())
+    return found
 
 
 def _fullest(unseen: Mask, axis: int) -> int:
