@@ -107,6 +107,7 @@ class Experiment:
     measure: Callable[[Settings, int], Metrics]  # figures by name, the unit in the name, of settings and a seed
     limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
     limit: str = "closed form"  # what these are
+    counts: tuple[str, ...] = ()  # figures that a study adds up over its trials
 
 
 def experiment(name: str) -> Experiment:
