@@ -10,6 +10,8 @@ from scenes.noise import smooth_noise
 from scenes.tumour import caliper, golden_spiral, tumour
 
 MassForm = Literal["round", "oval", "lobulated", "irregular", "spiculated"]
+CIRCUMSCRIBED: tuple[MassForm, ...] = ("round", "oval", "lobulated")
+"""forms with an even border, which shines where sound meets it squarely; others have no rim"""
 
 
 def mass(form: MassForm, size_mm: float, rng: np.random.Generator) -> trimesh.Trimesh:

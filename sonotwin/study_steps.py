@@ -31,6 +31,9 @@ def sweep(config: "Config", console: Console) -> bool:
         document_tables.check_place(config.document, config.name)
     done = do(config, opened(config), trials, console)
     of = experiment_runs.experiment(config.of)
+    for figure in of.counts:
+        counted = finite(one.figures.get(figure) for one in done)
+        console.print(f"count       {figure} {counted.sum():g} in {counted.size} trials", markup=False)
     for figure, limit in of.limits.items():
         sign = "± " if (finite(one.figures.get(figure) for one in done) < 0).any() else ""  # an error, beside a size
         beside = f", {of.limit} {sign}{_range(done, limit)}" if limit else ""

@@ -1,14 +1,15 @@
-"""The breast phantom: a silicone breast with three lobulated tumours, lying on a dark table with its apex to the camera.
+"""The breast phantom: a silicone breast with three lobulated tumours, or others, on a dark table with its apex to the camera.
 
 Skin relief, areola, table and tumours are drawn from a seed; sizes are exact.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
@@ -17,11 +18,13 @@ from recon.geometry import rigid
 from recon.geometry.surface_tree import surface_tree
 from recon.model.rig import Finite, Fraction, NotNegative, Part, Positive, Vector
 from scenes import solid_meshes
+from scenes.acoustics import TISSUES
 from scenes.dome import Dome, Form, dome
+from scenes.mass_forms import CIRCUMSCRIBED, MassForm, mass
 from scenes.noise import Seed, smooth_noise
 from scenes.scene_types import Material, Scene, Thing
 from scenes.table import table
-from scenes.tumour import tumour
+from scenes.tissue import Tissue
 
 MADE_OF = {"": "gel", "breast": "silicone", "tumour": "tumour", "table": "wood"}  # for ultrasound; see `scenes.acoustics`
 
@@ -30,10 +33,18 @@ Depth = Callable[[Array], Array]  # of points : (n, 3) below a surface, (n,) mm;
 
 
 class Tumour(Part):
-    """One tumour: its greatest extent, and where its middle lies in the phantom's frame (z up from the base)."""
+    """One tumour: its greatest extent, its middle in the phantom's frame (z up from the base), its form, its look by sound."""
 
     size_mm: Annotated[float, Field(ge=2, le=80)]
     centre_mm: Vector
+    form: MassForm = "lobulated"
+    echo_db: Finite | None = -12.0  # backscatter over that of fat; the silicone's is 2; None is free of echoes
+    loss_db: NotNegative = 0.9  # dB/cm/MHz; the silicone's is 0.6, and fluid's 0.05: a mass of that without echoes is a cyst
+
+    def tissue(self) -> Tissue | None:
+        """What sound meets in it; None of a usual one."""
+        tissue = replace(TISSUES["tumour"], echogenicity=self.echo_db, attenuation=self.loss_db)
+        return None if tissue == TISSUES["tumour"] else tissue
 
 
 class Outside(Part):
@@ -87,6 +98,7 @@ class Config(Outside):
         Tumour(size_mm=12.0, centre_mm=(22.0, -22.0, 19.0)),
     )
     tissue_mm: NotNegative = 5.0  # least tissue between a tumour and the skin or the base
+    apart_mm: Annotated[float, Field(ge=-5, le=50)] = 1.0  # the same between two; below 0 they may reach so far into each other
 
 
 def build(config: Config) -> Scene:
@@ -97,26 +109,40 @@ def build(config: Config) -> Scene:
     InputError
         If a tumour lies too near to the skin, to the base or to another tumour.
     """
-    shape_rng, colour_rng, tumour_rng = np.random.default_rng(config.seed).spawn(3)
-    skin = dome(form_of(config), shape_rng)
-    breast = closed(skin)
-    streams, depth_below = tumour_rng.spawn(len(config.tumours)), depth_in(open_mesh(skin))
-    masses = [
-        solid_meshes.moved(tumour(wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
-        for wanted, rng in zip(config.tumours, streams, strict=True)
-    ]
-    for k, mass in enumerate(masses):
-        check_depth(f"tumours.{k}", mass, depth_below, config.tissue_mm)
-        _check_apart(k, masses)
+    skin, bodies, (_, colour_rng, _) = skin_of(config), bodies_of(config), _streams(config)
+    depth_below, middles = depth_in(open_mesh(skin)), [one.centre_mm for one in config.tumours]
+    for k, body in enumerate(bodies):
+        check_depth(f"tumours.{k}", body, depth_below, config.tissue_mm)
+        _check_apart(bodies[: k + 1], config.apart_mm)
+        check_middles("tumours", middles, bodies[: k + 1])
 
     world = world_from_phantom(config)
     material = Material(config.reflectance, config.roughness, config.ior, translucent=True)
-    things = [Thing("breast", solid_meshes.moved(breast, world), material, albedo(config, skin, colour_rng))]
-    things += [
-        Thing(f"tumour{k}", solid_meshes.moved(mass, world), Material(config.reflectance), inside=True)
-        for k, mass in enumerate(masses)
-    ]
+    things = [Thing("breast", solid_meshes.moved(closed(skin), world), material, albedo(config, skin, colour_rng))]
+    for k, (wanted, body) in enumerate(zip(config.tumours, bodies, strict=True)):
+        placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
+        own = wanted.tissue()
+        things.append(Thing(f"tumour{k}", placed, Material(config.reflectance), inside=True, tissue=own, mirrors=even))
     return Scene("breast", (*things, table(config.table_mm, config.seed)))
+
+
+def skin_of(config: Config) -> Dome:
+    """The skin that its seed gives, in the phantom's frame."""
+    return dome(form_of(config), _streams(config)[0])
+
+
+def bodies_of(config: Config) -> list[trimesh.Trimesh]:
+    """Its tumours, in the phantom's frame."""
+    streams = _streams(config)[2].spawn(len(config.tumours))
+    return [
+        solid_meshes.moved(mass(wanted.form, wanted.size_mm, rng), rigid.transform(np.eye(3), wanted.centre_mm))
+        for wanted, rng in zip(config.tumours, streams, strict=True)
+    ]
+
+
+def _streams(config: Config) -> list[np.random.Generator]:
+    """Random numbers of skin, colour and tumours."""
+    return np.random.default_rng(config.seed).spawn(3)
 
 
 def world_from_phantom(config: Outside) -> Array:
@@ -174,13 +200,28 @@ def least_tissue(mass: trimesh.Trimesh, below_skin: Depth) -> float:
     return float(min(below_skin(mass.vertices).min(), mass.vertices[:, 2].min()))
 
 
-def _check_apart(k: int, masses: list[trimesh.Trimesh]) -> None:
-    """Refuse tumour k if it comes nearer than `APART_MM` to an earlier one, or one lies within the other."""
-    apart_mm = 1.0  # of tissue between two tumours
-    for other in range(k):
-        gap = -max(depth(masses[k].vertices, masses[other]).max(), depth(masses[other].vertices, masses[k]).max())
-        if gap < apart_mm:
-            raise InputError(f"tumours.{k}: expected at least {apart_mm:g} mm from tumours.{other}, found {gap:.2f} mm")
+def check_middles(name: str, middles: Sequence[ArrayLike], bodies: Sequence[trimesh.Trimesh]) -> None:
+    """Refuse the last of some masses if its middle lies in an earlier one, or one's in it: they may touch, but hide no other."""
+    last = len(bodies) - 1
+    for other in range(last):
+        pairs = ((middles[last], bodies[other]), (middles[other], bodies[last]))
+        inside_mm = max(depth(np.array([middle]), body)[0] for middle, body in pairs)
+        if inside_mm > 0:
+            expected = f"expected its middle outside of {name}.{other}, and that one's outside of it"
+            raise InputError(f"{name}.{last}: {expected}, found one {inside_mm:.1f} mm within")
+
+
+def _check_apart(bodies: Sequence[trimesh.Trimesh], apart_mm: float) -> None:
+    """Refuse the last of some tumours if it comes nearer than `apart_mm` to an earlier one, or one lies within the other."""
+    last = len(bodies) - 1
+    for other in range(last):
+        if (found := gap(bodies[last], bodies[other])) < apart_mm:
+            raise InputError(f"tumours.{last}: expected at least {apart_mm:g} mm from tumours.{other}, found {found:.2f} mm")
+
+
+def gap(one: trimesh.Trimesh, other: trimesh.Trimesh) -> float:
+    """Least tissue between two bodies, mm; below 0 by how far one reaches into the other."""
+    return -float(max(depth(one.vertices, other).max(), depth(other.vertices, one).max()))
 
 
 def depth(points: Array, surface: trimesh.Trimesh) -> Array:

@@ -4,7 +4,6 @@ Masses lie in what has grown as they are: touching, in clusters, in gland or fat
 that of the breast phantom.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Literal
@@ -23,15 +22,15 @@ from scenes.kinds.breast import (
     Outside,
     albedo,
     check_depth,
+    check_middles,
     closed,
-    depth,
     depth_in,
     form_of,
     least_tissue,
     open_mesh,
     world_from_phantom,
 )
-from scenes.mass_forms import MassForm, mass
+from scenes.mass_forms import CIRCUMSCRIBED, MassForm, mass
 from scenes.scene_types import Layer, Layers, Material, Scene, Thing
 from scenes.tissue import Tissue
 from scenes.tumour import caliper
@@ -58,8 +57,6 @@ ECHOES: dict[Pattern, float | None] = {
 """dB over fat, the reference of BI-RADS; carcinomas and fibroadenomas of Nam et al. 2013 lie 2 to 12 dB below the gland"""
 LOSSES: dict[Behind, float] = {"none": 0.8, "enhancement": 0.3, "shadow": 1.6}
 """dB/cm/MHz; what lies above and beside a mass loses some 0.75"""
-CIRCUMSCRIBED: tuple[MassForm, ...] = ("round", "oval", "lobulated")
-"""forms with an even border, which shines where sound meets it squarely; others have no rim"""
 FLAT: dict[MassForm, float] = {"round": 0.92, "oval": 0.7, "lobulated": 0.75, "irregular": 0.9, "spiculated": 1.0}
 """height over what the form would have: benign masses lie along the tissue's planes, wider than tall; shares assumed"""
 MODULI: dict[Pattern, float] = {"anechoic": 1.0, "hypoechoic": 16.0, "isoechoic": 6.4, "hyperechoic": 3.25, "complex": 2.0}
@@ -167,7 +164,7 @@ def build(config: Config) -> Scene:
         body = _lying(wanted, rng)
         check_depth(f"masses.{k}", body, below_skin, config.least_mm)
         bodies.append(body)
-        _check_middles(masses, bodies)
+        check_middles("masses", [one.centre_mm for one in masses], bodies)
         placed, even = solid_meshes.moved(body, world), wanted.form in CIRCUMSCRIBED
         things.append(Thing(f"mass{k}", placed, Material(0.3), inside=True, tissue=wanted.tissue(), mirrors=even))
         if wanted.pattern == "complex":
@@ -237,17 +234,6 @@ def _lying(wanted: Mass, rng: np.random.Generator) -> trimesh.Trimesh:
     """A mass in its place, in the breast's frame."""
     flat = _flattened(mass(wanted.form, wanted.size_mm, rng), FLAT[wanted.form])
     return solid_meshes.moved(flat, rigid.transform(np.eye(3), wanted.centre_mm))
-
-
-def _check_middles(masses: Sequence[Mass], bodies: Sequence[trimesh.Trimesh]) -> None:
-    """Refuse the last of some masses if its middle lies in an earlier one, or one's in it: they may touch, but hide no other."""
-    last = len(bodies) - 1
-    for other in range(last):
-        pairs = ((masses[last], bodies[other]), (masses[other], bodies[last]))
-        inside_mm = max(depth(np.array([mass.centre_mm]), body)[0] for mass, body in pairs)
-        if inside_mm > 0:
-            expected = f"expected its middle outside of masses.{other}, and that one's outside of it"
-            raise InputError(f"masses.{last}: {expected}, found one {inside_mm:.1f} mm within")
 
 
 def _flattened(body: trimesh.Trimesh, height: float) -> trimesh.Trimesh:

@@ -28,6 +28,7 @@ from scenes.kinds.board import Config as Board
 from twin.conditions import IDEAL, Conditions
 from twin.experiments.drawn_session import ROLL_DEG, Noise
 from twin.experiments.layout import Layout
+from twin.experiments.mass_conditions import MassCondition
 from twin.llvm import prepare
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
@@ -45,6 +46,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "tank": "twin.experiments.tank_trial",
     "breast": "twin.experiments.breast_trial",
     "patient": "twin.experiments.patient_trial",
+    "masses": "twin.experiments.mass_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
@@ -85,6 +87,7 @@ class Settings(Part):
     noise: Noise = Noise()
     wire_path: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
     ultrasound: Transducer = Transducer()
+    masses: MassCondition = MassCondition()
     ranges: DataRanges
 
     @model_validator(mode="after")
@@ -107,6 +110,7 @@ class Experiment:
     measure: Callable[[Settings, int], Metrics]  # figures by name, the unit in the name, of settings and a seed
     limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
     limit: str = "closed form"  # what these are
+    counts: tuple[str, ...] = ()  # figures that a study adds up over its trials
 
 
 def experiment(name: str) -> Experiment:

@@ -71,15 +71,17 @@ def plots(folder: Path, done: Sequence[Done], of: Experiment, names: Mapping[str
 
 
 def points(done: Sequence[Done], of: Experiment, names: Mapping[str, Name] = NO_NAMES) -> Section:
-    """A table of medians of all points."""
+    """A table of all points: sums of counts, and medians of other figures."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
-    titles = []
+    titles = [_name(names, figure).title for figure in of.counts]
     for figure, limit in of.limits.items():
         table, shown_as = study_plots.comparable(table, figure, limit, _name(names, figure))
         titles.append(shown_as)
     head = [*map(words, fields), "trials", *titles]
     caption = f"Medians over seeds; in brackets: {of.limit}."
-    return Section("All points", [page.table(head, _points(table, fields, of.limits), caption)])
+    if of.counts:
+        caption = f"Sums over seeds of {words(of.counts[0])} to {words(of.counts[-1])}. Medians over seeds of all else."
+    return Section("All points", [page.table(head, _points(table, fields, of), caption)])
 
 
 def title(text: str) -> str:
@@ -107,12 +109,13 @@ def kept_drawing(folder: Path, name: str, drawn: Figure, caption: str, detail: s
     return page.drawing(figures.inline_svg(drawn), caption, detail)
 
 
-def _points(table: study_plots.Table, fields: Sequence[str], limits: Mapping[str, str]) -> Iterator[list[str]]:
-    """A row a point of the design: its values, its trials, and medians of the figures beside their closed forms."""
+def _points(table: study_plots.Table, fields: Sequence[str], of: Experiment) -> Iterator[list[str]]:
+    """A row a point of the design: its values, its trials, sums of counts, and medians of figures beside their closed forms."""
     for point in _distinct_points(table, fields)[:MOST_ROWS]:
         alike = [row for row in table if tuple(row[field] for field in fields) == point]
-        cells = [_median(alike, figure) + (f" ({_median(alike, limit)})" if limit else "") for figure, limit in limits.items()]
-        yield [*(short(value) for value in point), str(len(alike)), *cells]
+        sums = [shown(float(study_runs.finite(row.get(figure) for row in alike).sum()), ".6g") for figure in of.counts]
+        cells = [_median(alike, figure) + (f" ({_median(alike, limit)})" if limit else "") for figure, limit in of.limits.items()]
+        yield [*(short(value) for value in point), str(len(alike)), *sums, *cells]
 
 
 def _median(rows: study_plots.Table, figure: str) -> str:

@@ -23,6 +23,7 @@ TICKS = 6  # of an even axis, so that numbers of many digits stay apart
 MOST_VALUES = 24  # of a factor; more are drawn as points
 WIDE = 1.5  # ratio of the largest to the smallest step between values, above which an axis is logarithmic
 LETTERS = 38  # in a line beside an axis
+CROWDED = 60  # letters below an axis, above which its words stand upright
 ASIDE = 0.14  # of the distance between words on an axis: that between courses over one of them
 TALL = 8.0  # ratio of the largest to the smallest figure, likewise
 
@@ -122,7 +123,7 @@ def _along(axes: Axes, places: Array, found: Sequence[Course], held: Sequence[Co
 def _beside(axes: Axes, values: Sequence[str], found: Sequence[Course], held: Sequence[Course], kind: str) -> None:
     """Courses over words, beside each other, with their ranges as bars, and what they are held against as strokes."""
     places, aside = np.arange(len(values)), ASIDE * (np.arange(len(found)) - (len(found) - 1) / 2)
-    axes.set_xticks(places, values)
+    axes.set_xticks(places, values, rotation=90 if sum(map(len, values)) > CROWDED else 0)
     axes.set_xlim(-0.5, len(values) - 0.5)
     for k, one in enumerate(found):
         axes.vlines(places + aside[k], one.low, one.high, color=f"C{k}", alpha=0.35, linewidth=5)

@@ -1,5 +1,7 @@
 """The phantom: the paper's sizes, tumours within, seen by camera and projector, the look of a breast."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from scipy.interpolate import LinearNDInterpolator
 
 from recon.errors import InputError
 from recon.geometry import rigid
+from scenes.acoustics import TISSUES, tissue_of
 from scenes.dome import disc
 from scenes.kinds import breast
 from scenes.tumour import caliper
@@ -85,6 +88,38 @@ def test_misplaced_tumours_are_refused(tumours, named):
     wanted = tuple(breast.Tumour(size_mm=size, centre_mm=centre) for size, centre in tumours)
     with pytest.raises(InputError, match=named):
         breast.build(breast.Config(tumours=wanted, edge_mm=2.0))
+
+
+def test_tumours_are_made_of_what_they_are_said_to_be():
+    """A usual one keeps the tissue of its name; a cyst is free of echoes; what has no even border has no rim."""
+    plain, cyst, bright = (
+        breast.Tumour(size_mm=10, centre_mm=centre, **fields)
+        for centre, fields in (
+            ((-20, 0, 20), {}),
+            ((0, 0, 20), {"form": "round", "echo_db": None, "loss_db": 0.05}),
+            ((20, 0, 20), {"form": "spiculated", "echo_db": 8.0}),
+        )
+    )
+    scene = breast.build(breast.Config(tumours=(plain, cyst, bright), edge_mm=2.0))
+    hidden = [thing for thing in scene.things if thing.inside]
+    usual, fluid, shining = (tissue_of(scene, thing) for thing in hidden)
+    assert hidden[0].tissue is None and usual == TISSUES["tumour"]
+    assert (fluid.echogenicity, fluid.attenuation) == (None, 0.05)
+    assert shining == replace(TISSUES["tumour"], echogenicity=8.0)
+    assert [thing.mirrors for thing in hidden] == [True, True, False]
+    assert [caliper(thing.mesh.vertices) for thing in hidden] == pytest.approx([10, 10, 10])
+
+
+def test_tumours_may_touch_or_reach_into_each_other_if_asked():
+    """Balls of 20 mm, 2 mm within each other; but none may have another's middle in it."""
+    balls = [breast.Tumour(size_mm=20, centre_mm=(x, 0, 20), form="round") for x in (-9, 9)]
+    with pytest.raises(InputError, match=r"tumours\.1: expected at least 1 mm"):
+        breast.build(breast.Config(tumours=balls, edge_mm=2.0))
+    scene = breast.build(breast.Config(tumours=balls, edge_mm=2.0, apart_mm=-3.0))
+    assert -3 < breast.gap(*(thing.mesh for thing in scene.things if thing.inside)) < 0
+    inner = breast.Tumour(size_mm=4, centre_mm=(-1.5, 0, 20), form="round")  # 2.5 mm deep in the first
+    with pytest.raises(InputError, match=r"tumours\.1: expected its middle outside of tumours\.0"):
+        breast.build(breast.Config(tumours=(balls[0], inner), edge_mm=2.0, apart_mm=-5.0))
 
 
 @pytest.mark.parametrize(("eye", "share"), [(np.zeros(3), 0.995), (PROJECTOR, 0.97)])

@@ -12,6 +12,7 @@ from recon.errors import InputError
 from scenes.acoustics import TISSUES, tissue_of
 from scenes.anatomy import Anatomy
 from scenes.kinds import breast, patient
+from scenes.mass_forms import CIRCUMSCRIBED
 from twin.session import describe
 
 COARSE = {"edge_mm": 3.0, "anatomy": Anatomy(voxel_mm=2.0)}
@@ -99,7 +100,7 @@ def test_the_words_of_drawn_masses_go_together(drawn):
     for one in masses:
         assert (one.behind == "enhancement") == (one.pattern == "anechoic")
         assert one.pattern == "anechoic" or one.form != "round"
-        assert one.pattern == "hypoechoic" or (one.behind != "shadow" and one.form in patient.CIRCUMSCRIBED)
+        assert one.pattern == "hypoechoic" or (one.behind != "shadow" and one.form in CIRCUMSCRIBED)
 
 
 def test_a_draw_searches_one_tree(monkeypatch):

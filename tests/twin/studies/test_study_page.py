@@ -112,6 +112,17 @@ def test_the_table_has_medians_a_point(page):
     assert "Medians over seeds; in brackets: noise alone." in text(page) and "closed form" not in page
 
 
+def test_counts_are_added_up_over_seeds(tmp_path):
+    """A miss in one of four trials is a miss, which no median shows; a trial without figures counts nothing."""
+    of = Experiment((), lambda settings, seed: {}, {"error_mm": ""}, counts=("masses_missed", "masses_false"))
+    counted = [{"masses_missed": float(seed == 2), "masses_false": 2.0, "error_mm": 0.1 * seed} for seed in range(4)]
+    trials = [done({"light": "dim"}, figures, seed) for seed, figures in enumerate(counted)] + [done({"light": "dim"}, "dark", 4)]
+    page = written(tmp_path, trials, [study_page.points(trials, of, study_page.NO_NAMES)])
+    assert rows_of(page)[-2] == ["light", "trials", "masses missed", "masses false", "error, mm"]
+    assert rows_of(page)[-1] == ["dim", "5", "1", "8", "0.15"]
+    assert "Sums over seeds of masses missed to masses false. Medians over seeds of all else." in text(page)
+
+
 def test_points_without_figures_are_named(tmp_path):
     trials = [*DONE, done({"rig.pitch": 40, "light": "dim"}, "coverage: found none", 7)]
     page = text(written(tmp_path, trials, [study_page.points(trials, OF, study_page.NO_NAMES)]))
