@@ -4,10 +4,7 @@ Poses have the noise of `PoseNoise` and its covariance; probe, lag and the tissu
 that of the breast at rest.
 """
 
-import logging
-import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +20,7 @@ from recon.geometry import rigid
 from recon.geometry.surface_tree import signed_distances
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES
-from recon.segmentation.segmented_scans import Segmented
+from recon.segmentation.left_out import LeftOut
 from recon.session import masses_step
 from scenes.acoustics import TISSUES
 from scenes.scene_types import Thing
@@ -44,8 +41,6 @@ Mask = NDArray[np.bool_]
 PATH = SurfacePath(start_mm=(-22.0, -31.0), end_mm=(-22.0, 36.0), strokes=2, stroke_step_mm=44.0, speed_mm_s=21.0)
 CLOCKS, NOISE = Clocks(), PoseNoise()
 TISSUE_M_S = TISSUES["silicone"].speed
-LOGGED = "recon.segmentation"  # whose warnings name what is left out
-GAP = "gap"  # a reason
 MARGIN_MM = 1.0  # around masses that is scanned, too: bodies at the scan's edges are none
 NEAR_MM = 1.5  # to a B-scan's plane, within which a point is scanned: they lie up to 1.6 mm apart
 
@@ -60,17 +55,6 @@ class Judgement:
 
 
 LIMITS = Judgement()
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A dark body that is no mass, or a gap that no B-scan shows, with its reason."""
-
-    reason: str
-    centre: Array  # (3,) mm in the world
-    volume_mm3: float
-    extents_mm: Array  # (3,) along array and beam, and across the B-scans
-    text: str
 
 
 @dataclass(frozen=True)
@@ -92,14 +76,14 @@ def measure(settings: Settings, seed: int) -> Metrics:
     check_scanned(planned, hidden)
     skin = sweep_errors.facing(sweep_session.surface_of("", planned.scanned).mesh)
     kept = kept_scans(condition, planned, hidden, np.random.default_rng([seed, 50]))
-    with TemporaryDirectory() as folder, logged() as told:
+    with TemporaryDirectory() as folder:
         scans = recorded(planned, Path(folder))
         scans = replace(scans, world_from_pixel=np.where(kept[:, None, None], scans.world_from_pixel, np.nan))
         found = masses_step.find(scans, masses_step.Method(overlays=0), skin)
     shown = [thing for thing in hidden if seen(planned, inner_points(thing.mesh), kept).any()]
     sigmas = [found.figures[f"{name}_centre_sigma_mm"] for name in found.meshes]
     doubted = any(line.startswith("warning") for line in found.lines)
-    said = Findings(list(found.meshes.values()), sigmas, named_places(found, told), doubted, axes(scans))
+    said = Findings(list(found.meshes.values()), sigmas, found.left_out, doubted, axes(scans))
     return judge(shown, said) | {"contact_mm": found.figures.get("contact_mm", np.nan)}
 
 
@@ -186,43 +170,6 @@ def axes(scans: Scans) -> Array:
     return mean / np.linalg.norm(mean, axis=0)
 
 
-@contextmanager
-def logged() -> Iterator[list[str]]:
-    """Warnings of the segmentation, as they come."""
-    told: list[str] = []
-
-    class Kept(logging.Handler):
-        def emit(self, record: logging.LogRecord) -> None:
-            told.append(record.getMessage())
-
-    logger, handler = logging.getLogger(LOGGED), Kept(logging.WARNING)
-    logger.addHandler(handler)
-    try:
-        yield told
-    finally:
-        logger.removeHandler(handler)
-
-
-def named_places(found: Segmented, told: Sequence[str]) -> list[LeftOut]:
-    """What is left out and named with its place, in the lines that the segmentation has logged."""
-    number = r"(-?[\d.]+)"
-    places = []
-    for text in told:
-        at = re.search(rf"(?:at|about) {number}, {number}, {number} mm", text)
-        volume, sides = re.search(rf"{number} mm3", text), re.search(rf"{number} x {number} x {number} mm", text)
-        gap = re.search(rf"^a gap of {number} mm", text)
-        if at is None:
-            continue
-        mm3, extents = float(volume[1]) if volume else 0.0, np.zeros(3)
-        if gap:  # as high as it is long
-            extents = np.array([np.sqrt(mm3 / float(gap[1]))] * 2 + [float(gap[1])])
-        elif sides:
-            extents = np.array([float(side) for side in sides.groups()])
-        centre = np.array([float(value) for value in at.groups()])
-        places.append(LeftOut(GAP if gap else "dark body", centre, mm3, extents, text))
-    return places
-
-
 def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
     """Count masses by what became of them; errors are NaN where none was found.
 
@@ -260,10 +207,10 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
 
 def names(one: LeftOut, mass: trimesh.Trimesh, axes: Array) -> bool:
     """Whether what is left out lies in a mass or near it, or is a gap that covers some of it."""
-    if one.reason == GAP:
-        aside = np.abs((inner_points(mass) - one.centre) @ axes)
-        return bool((aside <= one.extents_mm / 2).all(axis=1).any())
-    return bool(signed_distances(one.centre[None], mass)[0] <= LIMITS.near_mm)
+    if one.reason == "gap":
+        aside = np.abs((inner_points(mass) - np.array(one.centre_mm)) @ axes)
+        return bool((aside <= np.array(one.extents_mm) / 2).all(axis=1).any())
+    return bool(signed_distances(np.array([one.centre_mm]), mass)[0] <= LIMITS.near_mm)
 
 
 COUNTS = (

@@ -213,7 +213,9 @@ def test_a_streak_down_the_beam_is_no_mass(rng, caplog):
     streak = (np.abs(places[..., 0]) < 3) & (np.abs(places[..., 1] - 1) < 10) & (np.abs(places[..., 2]) < 4)
     assert not find(speckled(np.where(streak, DARK, 1.0), rng))
     (told,) = caplog.messages
-    assert re.match(r"a streak from 3, 69[12], 14 mm on, (19|20) mm down the beam and [56] mm thick, is left out: a shadow ", told)
+    assert re.match(
+        r"a streak from 3, 69[12], 14 mm on, (19|20) mm down the beam and [56] mm thick, is left out: a shadow ", told
+    )
     assert told.endswith("of a border, or a body longer down the beam than 2.5 times its thickness")
 
 

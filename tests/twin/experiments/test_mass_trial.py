@@ -10,13 +10,14 @@ import trimesh
 import yaml
 
 from recon.geometry import rigid
+from recon.segmentation.left_out import LeftOut
 from scenes.catalogue import parse_scene
 from scenes.kinds import breast
 from scenes.scene_types import Material, Thing
 from twin.experiments import mass_conditions, mass_trial
 from twin.experiments.mass_accuracy import PATH
 from twin.experiments.mass_conditions import CONDITIONS, Condition
-from twin.experiments.mass_trial import GAP, Findings, LeftOut
+from twin.experiments.mass_trial import Findings
 
 ROOT = Path(__file__).resolve().parents[3]
 LARGE, SMALL = ((0.0, 0.0, 670.0), 10.0), ((40.0, 0.0, 670.0), 5.0)
@@ -32,8 +33,8 @@ def ball(place=LARGE, shift=(0.0, 0.0, 0.0), larger: float = 1.0) -> trimesh.Tri
 TRUE = [Thing(f"tumour{k}", ball(place), Material(0.4), inside=True) for k, place in enumerate((LARGE, SMALL))]
 
 
-def left_out(centre, extents=(0.0, 0.0, 0.0), reason: str = "dark body") -> LeftOut:
-    return LeftOut(reason, np.array(centre), 100.0, np.array(extents), "")
+def left_out(centre, extents=(0.0, 0.0, 0.0), reason="weak contrast") -> LeftOut:
+    return LeftOut(reason=reason, volume_mm3=100.0, centre_mm=centre, extents_mm=extents, text="")
 
 
 def judged(*masses: trimesh.Trimesh, left=(), doubted: bool = False):
@@ -84,10 +85,10 @@ def test_a_missing_mass_is_named_by_a_place_in_it_or_near_it(beyond_mm, named):
 
 def test_a_missing_mass_is_named_by_a_gap_that_covers_some_of_it():
     """The gap is 6 mm wide across the B-scans, y here, and 60 mm long along the array, x: its middle lies far from the mass."""
-    gap = left_out((25.0, 5.0, 672.0), (60.0, 30.0, 6.0), GAP)
+    gap = left_out((25.0, 5.0, 672.0), (60.0, 30.0, 6.0), "gap")
     assert judged(ball(SMALL), left=[gap]) == {"right": 1, "named": 1}
-    assert judged(ball(SMALL), left=[replace(gap, centre=np.array([25.0, 14.0, 672.0]))]) == {"right": 1, "silent": 1}
-    assert judged(ball(SMALL), left=[replace(gap, centre=np.array([41.0, 5.0, 672.0]))]) == {"right": 1, "silent": 1}
+    assert judged(ball(SMALL), left=[gap.model_copy(update={"centre_mm": (25.0, 14.0, 672.0)})]) == {"right": 1, "silent": 1}
+    assert judged(ball(SMALL), left=[gap.model_copy(update={"centre_mm": (41.0, 5.0, 672.0)})]) == {"right": 1, "silent": 1}
 
 
 def test_what_is_found_where_nothing_is_is_false():
@@ -109,20 +110,6 @@ def test_two_masses_found_as_one_are_one_that_is_off_and_one_that_is_silent():
 def test_nothing_that_is_scanned_is_nothing_missed():
     figures = mass_trial.judge([], Findings([ball()], [0.1], [], False, AXES))
     assert (figures["masses_true"], figures["masses_silent"], figures["masses_false"]) == (0, 0, 1)
-
-
-def test_places_are_read_in_the_lines_of_the_segmentation():
-    told = [
-        "a gap of 12.5 mm in the sweep, 20000 mm3 about -18, -8, 676 mm, wasn't scanned: masses in it may be missed",
-        "2 smaller gaps, 900 mm3 together, weren't scanned",
-        "a dark body is cut by the sweep's end, and is left out: 1200 mm3 of it at -10, 4, 680 mm, 14 x 20 x 9 mm; scan on there",
-        "a dark streak at 26, -18, 676 mm, 20 mm down the beam and 4 mm thick, is left out: a shadow of a border, or a body "
-        "longer down the beam than 2.5 times its thickness",
-    ]
-    gap, cut, streak = mass_trial.named_places(SimpleNamespace(), told)
-    assert (gap.reason, gap.volume_mm3) == (GAP, 20000) and gap.extents_mm.tolist() == pytest.approx([40, 40, 12.5])
-    assert cut.centre.tolist() == [-10, 4, 680] and cut.extents_mm.tolist() == [14, 20, 9]
-    assert streak.centre.tolist() == [26, -18, 676]
 
 
 def made_up_sweep(scanners) -> SimpleNamespace:
