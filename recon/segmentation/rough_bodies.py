@@ -42,6 +42,7 @@ class MassLimits:
     least_mm3: float = 50.0
     fine_mm: float = 0.6  # the former, of small bodies, whose borders have no lobes
     small_mm3: float = 6.0  # least of what is seen of small bodies; speckle has none
+    dense: float = 0.8  # share of a small one's voxels with a pixel in them: between B-scans far apart are pieces of shadows
     few: int = 3  # small ones, at most, beyond which they are taken for the tissue's own unevenness
     streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
     core: float = 0.6  # of a mass's extent: its darkest part
@@ -62,6 +63,7 @@ class CutBodyLimits:
     before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
     around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
     bump_mm: float = 6.0  # by which the dark behind the tissue begins before its median, over as wide a place: a body's shadow
+    rim: float = 0.6  # share of that place's rim with dark behind it: at the tissue's edge it begins early
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
@@ -152,10 +154,12 @@ def rough(power: EchoPower) -> Rough:
         left_out += [_leave_out("small", one, power) for one in spots if ratio[one.part][one.inside].min() <= seed]
     chosen = [one for one in large if one.core <= seed]
     left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
-    if even or len(small) <= LIMITS.few:
-        chosen += small
-    else:
-        left_out += [_leave_out("small", one, power) for one in small]
+    for one in small:
+        dense = power.seen[one.part][one.inside].mean() > LIMITS.dense
+        if dense and (even or len(small) <= LIMITS.few):
+            chosen.append(one)
+        else:
+            left_out.append(_leave_out("small", one, power))
     cut, shadowed = _cut_bodies(dark, _mask(chosen, dark.shape), ratio, seen, gap, power)
     left_out += cut
     masses = list[Mass]()
@@ -421,11 +425,14 @@ def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
     front = np.where(columns, behind.argmax(axis=1), 0).astype(float) * spacing[1]
     labels, _ = ndimage.label(columns & (front < np.median(front[columns]) - CUT.bump_mm))
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        wide = labels[box] == number
+        wide = labels == number
+        rim = ndimage.binary_dilation(wide, iterations=3) & ~wide
+        if (rim & columns).sum() < CUT.rim * rim.sum():  # at the tissue's edge
+            continue
         across, along = ((s.stop - s.start) * float(step) for s, step in zip(box, spacing[::2], strict=True))
         if wide.sum() * spacing[0] * spacing[2] < CUT.bump_mm**2:
             continue
-        k, i = np.nonzero(labels == number)
+        k, i = np.nonzero(wide)
         row = (float(front[k, i].min()) + min(across, along) / 2) / spacing[1]
         places = np.array([i.mean() + part[2].start, row + part[1].start, k.mean() + part[0].start])
         x, y, z = rigid.apply(power.volume.world_from_voxel, places).tolist()

@@ -89,21 +89,23 @@ def _losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, 
 
 
 def passed(recording: Recording, grid: Grid, mass: Mass, sound: Sound) -> float:
-    """Mean power of tissue close behind a mass in the B-scans that it shadows, over that of tissue; NaN if none is seen there."""
+    """Mean power of tissue close behind a mass in the B-scans that it shadows, over that beside it; NaN if none is seen there."""
     inside, scale, table = distances([mass], grid), pixel_mm(recording.world_from_pixel), recording.table
-    thinned, near_mm, least_mm = 4, (1.5, 4.5), 3.0  # pixels of which one counts; behind the border; of the way through the mass
+    thinned, near_mm, least_mm = 4, (1.5, 4.5), 3.0  # pixels of which one counts; from the border; of the way through the mass
     rows = slice(recording.clip.v, None, thinned)
 
-    def behind(scan: tuple[NDArray[np.uint8], Array]) -> tuple[float, int]:
+    def near(scan: tuple[NDArray[np.uint8], Array]) -> Array:
         image, matrix = scan
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         away = _sample(inside, matrix, lines.u[rows], lines.v[rows])
-        used = (lines.within[rows] > least_mm) & (away > near_mm[0]) & (away < near_mm[1])
-        return float(table[image[rows, ::thinned]][used].sum()), int(used.sum())
+        power, around = table[image[rows, ::thinned]], (away > near_mm[0]) & (away < near_mm[1])
+        behind, beside = around & (lines.within[rows] > least_mm), around & (lines.within[rows] == 0)
+        return np.stack([field.sum(axis=1) for field in (power * behind, behind, power * beside, beside)])
 
     scans = zip(recording.images(), recording.world_from_pixel, strict=True)
-    sums = np.array(list(threads.mapped(behind, (scan for scan in scans if np.isfinite(scan[1]).all()))))
-    return float(sums[:, 0].sum() / sums[:, 1].sum()) if sums[:, 1].any() else np.nan
+    sums = sum(threads.mapped(near, (scan for scan in scans if np.isfinite(scan[1]).all())), np.zeros(1))
+    behind, count, beside, others = sums[:, (sums[1] > 0) & (sums[3] > 0)]  # rows with both
+    return float(behind.sum() / (count * beside / others).sum()) if len(count) else np.nan
 
 
 def _fitted_losses(total: Array, count: Array) -> tuple[float, float]:
