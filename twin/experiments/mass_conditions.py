@@ -49,6 +49,7 @@ class Condition:
     """What is unlike the usual sweep."""
 
     masses: tuple[Tumour, ...] = USUAL
+    breast: Mapping[str, Any] = field(default_factory=dict)  # fields of the scene
     apart_mm: float | None = None  # of tissue between the first two; None: as their places have it
     under_skin_mm: tuple[float, float] | None = None  # least tissue over each, drawn between both; None: likewise
     lost_s: float = 0.0  # for which poses are lost over the largest mass
@@ -64,6 +65,8 @@ PAIR = (Tumour(size_mm=14.0, centre_mm=(-20.0, 2.0, 22.0)), Tumour(size_mm=12.0,
 SHALLOW = (Tumour(size_mm=12.0, centre_mm=(-26.0, 6.0, 30.0)), Tumour(size_mm=10.0, centre_mm=(30.0, 14.0, 30.0)))
 CYST = {"echo_db": None, "loss_db": 0.05}
 PRESSED = Living(yields=True, element_mm=5.0)
+FLAT = {"size_mm": (170.0, 130.0, 49.5), "nipple_height_mm": 1.5}
+"""a breast whose nipple, 5.5 mm lower, isn't pressed to less than what the twin can show"""
 
 CONDITIONS = {
     "usual": Condition(),
@@ -71,7 +74,7 @@ CONDITIONS = {
     "gap_1s": Condition(lost_s=1.0),
     "every_3mm": Condition(every_mm=3.0),
     "every_5mm": Condition(every_mm=5.0),
-    "first_quarter": Condition(share=0.25),
+    "first_fifth": Condition(share=0.2),
     "first_half": Condition(share=0.5),
     "first_two_thirds": Condition(share=2 / 3),
     "touching": Condition(PAIR, apart_mm=0.0),
@@ -88,7 +91,7 @@ CONDITIONS = {
     "noisy": Condition(ultrasound={"noise_db": 15.0}),
     "shallow": Condition(SHALLOW, under_skin_mm=(2.0, 3.0)),
     **{f"small_{size}": Condition(_usual(size_mm=float(size))) for size in (4, 5, 6)},
-    **{f"pressed_{by}": Condition(standoff_mm=-float(by), living=PRESSED) for by in (1, 2, 3)},
+    **{f"pressed_{by}": Condition(breast=FLAT, standoff_mm=-float(by), living=PRESSED) for by in (1, 2, 3)},
     **{f"breathing_{by}": Condition(living=Living(breathing_mm=float(by))) for by in (2, 5)},
 }
 
@@ -120,7 +123,8 @@ def scene(condition: Condition, seed: int) -> dict[str, Any]:
     if condition.apart_mm is not None:
         moves[1] = moves[0]
     places = [one.centre_mm + move for one, move in zip(condition.masses, moves, strict=True)]
-    config = _placed(breast.Config(seed=SEED + seed, tumours=condition.masses, edge_mm=EDGE_MM), places)
+    fields: dict[str, Any] = {"seed": SEED + seed, "edge_mm": EDGE_MM, **condition.breast}
+    config = _placed(breast.Config(tumours=condition.masses, **fields), places)
     least_mm = {"tissue_mm": LEAST_MM}
     if condition.apart_mm is not None:
         config = _parted(config, aside, condition.apart_mm)
@@ -129,7 +133,7 @@ def scene(condition: Condition, seed: int) -> dict[str, Any]:
         config = _raised(config, thick)
         least_mm |= {"tissue_mm": condition.under_skin_mm[0] - GIVES_MM}
     tumours = [one.model_dump(mode="json") for one in config.tumours]
-    return {"kind": "breast", "seed": config.seed, "edge_mm": EDGE_MM, "tumours": tumours} | least_mm
+    return {"kind": "breast", **fields, **least_mm, "tumours": tumours}
 
 
 def _level(rng: np.random.Generator) -> Array:

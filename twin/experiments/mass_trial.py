@@ -187,6 +187,7 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
     taken = {pair.number for pair in here}
     false = [mass for number, mass in enumerate(said.masses) if number not in taken]
     warned = [said.doubted or any(names(one, mass, said.axes) for one in said.left_out) for mass in false]
+    bodies = [one for one in said.left_out if one.reason != GAP]
     over = [pair.centre_error_mm / said.sigmas_mm[pair.number] for pair in here]
     return {
         "masses_true": len(hidden),
@@ -197,6 +198,7 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
         "masses_silent": len(hidden) - len(here) - named,
         "masses_false": len(false),
         "masses_false_warned": sum(warned),
+        "named_nowhere": sum(not any(names(one, thing.mesh, said.axes) for thing in hidden) for one in bodies),
         "centre_error_mm": float(np.mean(centres)) if here else np.nan,
         "worst_centre_error_mm": max(centres) if here else np.nan,
         "volume_error_percent": 100 * float(np.mean(volumes)) if here else np.nan,
@@ -222,6 +224,7 @@ COUNTS = (
     "masses_silent",
     "masses_false",
     "masses_false_warned",
+    "named_nowhere",
 )
 ERRORS = {
     "centre_error_mm": "",

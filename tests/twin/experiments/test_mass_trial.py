@@ -100,6 +100,13 @@ def test_what_is_found_where_nothing_is_is_false():
     assert judged(*whole, elsewhere, piece, doubted=True) == {"right": 2, "false": 2, "false_warned": 2}
 
 
+def test_what_is_named_where_no_mass_is_is_counted():
+    """So that naming more than there is doesn't count as gain; gaps lie where they lie."""
+    left = [left_out((0.0, 0.0, 670.0)), left_out((0.0, 40.0, 670.0)), left_out((0.0, 40.0, 670.0), (9.0, 9.0, 9.0), GAP)]
+    figures = mass_trial.judge(TRUE, Findings([ball(LARGE), ball(SMALL)], [0.1, 0.1], left, False, AXES))
+    assert (figures["masses_right"], figures["named_nowhere"]) == (2, 1)
+
+
 def test_two_masses_found_as_one_are_one_that_is_off_and_one_that_is_silent():
     near = [TRUE[0], Thing("tumour1", ball(((14.0, 0.0, 670.0), 4.0)), Material(0.4), inside=True)]
     merged = trimesh.util.concatenate([thing.mesh for thing in near])
