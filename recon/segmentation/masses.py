@@ -77,27 +77,28 @@ def from_scans(
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
     first = rough(power)
-    masses, left_out = refined(first.masses, power, roughly), first.left_out
+    bright = [mass for mass in faint(power, [], first.hidden).masses if mass.bright] if first.even else []
+    masses, left_out = refined([*first.masses, *bright], power, roughly), first.left_out
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            left_out += [_shadow(mass) for mass in masses if not _is_dark(mass, power)]
-            masses = refined([mass for mass in masses if _is_dark(mass, power)], power, times)
+            left_out += [_shadow(mass) for mass in masses if _is_shadow(mass, power)]
+            masses = refined([mass for mass in masses if not _is_shadow(mass, power)], power, times)
     more = faint(power, masses, first.hidden) if first.even else Found([], [])
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
-        left_out += [_shadow(mass) for mass in masses if not _is_dark(mass, power)]
-        masses = [mass for mass in masses if _is_dark(mass, power)]
-        sure = refined(more.masses, power, sum(REFINEMENTS))
-        left_out += [_faint(mass) for mass in sure if not _stands_out(mass, power)]
-        masses += [mass for mass in sure if _stands_out(mass, power)]
+        left_out += [_shadow(mass) for mass in masses if _is_shadow(mass, power)]
+        masses = [mass for mass in masses if not _is_shadow(mass, power)]
+        masses += refined(more.masses, power, sum(REFINEMENTS))
     kept = list[Mass]()
     for mass in masses:
         if passed(recording, grid, mass, sound) < LIMITS.passed:
             left_out.append(_left_out("its shadow hides its back", mass, "all behind it is dark, so its back isn't seen"))
         elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, "it may be the shadow of another, or that one its"))
+        elif first.even and not _stands_out(mass, power):
+            left_out.append(_left_out("weak contrast", mass, "it hardly differs from the tissue around"))
         else:
             kept.append(mass)
     masses = kept
@@ -139,11 +140,11 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     return grey
 
 
-def _is_dark(mass: Mass, power: EchoPower) -> bool:
-    """Whether a mass is still dark after the shadows of others have been taken away."""
+def _is_shadow(mass: Mass, power: EchoPower) -> bool:
+    """Whether a dark body isn't dark any more after the shadows of others have been taken away."""
     values = _sampled(power, _core(mass))
     seen = np.isfinite(values)
-    return bool(seen.mean() > LIMITS.least_seen and np.median(values[seen]) < LIMITS.still)
+    return not mass.bright and not (seen.mean() > LIMITS.least_seen and np.median(values[seen]) < LIMITS.still)
 
 
 def _stands_out(mass: Mass, power: EchoPower) -> bool:
@@ -185,11 +186,6 @@ def _sampled(power: EchoPower, places: Array) -> Array:
 def _shadow(mass: Mass) -> LeftOut:
     """Leave out what isn't dark any more."""
     return _left_out("shadow of a mass", mass, "masses before it shadow it")
-
-
-def _faint(mass: Mass) -> LeftOut:
-    """Leave out what has no border all around."""
-    return _left_out("weak contrast", mass, "it hardly differs from the tissue around")
 
 
 def _left_out(reason: Reason, mass: Mass, why: str) -> LeftOut:

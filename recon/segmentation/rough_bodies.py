@@ -88,7 +88,11 @@ class FaintLimits:
     seed: float = 0.33  # in even tissue, above the power of a dark body's core
     dark: float = 0.5  # there, of a small body's power: speckle blurs its core
     smooth_mm: float = 1.0  # standard deviation: over five times the voxels of a dark body's, as the contrast is less
-    brightest: float = 4.0  # of power over the tissue's: brighter voxels count as this in its level
+    around_mm: tuple[float, ...] = (
+        12.0,
+        12.0,
+        8.0,
+    )  # standard deviations over which the tissue's level is taken, one after another
     least_db: float = 2.4  # of contrast, at least
     core_db: float = 2.8  # of contrast in its middle
     beside_mm: float = 2.0  # of masses, where shadows and borders are left over
@@ -154,9 +158,10 @@ def rough(power: EchoPower) -> Rough:
         left_out += [_leave_out("small", one, power) for one in spots if ratio[one.part][one.inside].min() <= seed]
     chosen = [one for one in large if one.core <= seed]
     left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
+    behind = np.logical_or.accumulate(_widen(_mask(chosen, dark.shape), 2 * LIMITS.grow_mm, spacing), axis=1)
     for one in small:
-        dense = power.seen[one.part][one.inside].mean() > LIMITS.dense
-        if dense and (even or len(small) <= LIMITS.few):
+        sure = power.seen[one.part][one.inside].mean() > LIMITS.dense and not behind[one.part][one.inside].any()
+        if sure and (even or len(small) <= LIMITS.few):
             chosen.append(one)
         else:
             left_out.append(_leave_out("small", one, power))
@@ -180,16 +185,20 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
 
     hidden : voxels where none are looked for, as of `rough`
     """
-    spacing, volume, seen = power.volume.spacing[::-1], power.volume, power.weight > 0
-    known = seen & ~hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
-    smooth = _smooth(volume.voxels, power.weight * known, FAINT.smooth_mm / spacing)
-    known &= np.isfinite(smooth)
-    contrast, even = np.zeros(seen.shape, np.float32), known
-    for _ in range(3):
-        level = _smooth(np.minimum(volume.voxels, FAINT.brightest), power.weight * even, LIMITS.around_mm / spacing)
+    spacing, volume = power.volume.spacing[::-1], power.volume
+    free = ~hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
+    smooth = _smooth(volume.voxels, power.weight * free, FAINT.smooth_mm / spacing)
+    seen = np.isfinite(_smooth(volume.voxels, power.weight, LIMITS.smooth_mm / spacing))
+    known = seen & free & np.isfinite(smooth)
+    depths = np.where(known, smooth, np.nan).swapaxes(0, 1).reshape(seen.shape[1], -1)
+    usual = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in depths])  # by depth
+    level, contrast = np.broadcast_to(usual[:, None], seen.shape), np.zeros(seen.shape, np.float32)
+    for around_mm in (*FAINT.around_mm, 0.0):
         told = known & (level > 0)
         contrast[told] = 10 * np.log10(np.maximum(smooth[told] / level[told], 1e-6))
-        even = told & (np.abs(contrast) < FAINT.least_db)
+        if around_mm:
+            level = _smooth(volume.voxels, power.weight * (told & (np.abs(contrast) < FAINT.least_db)), around_mm / spacing)
+            level = np.where(np.isfinite(level), level, usual[:, None])
     plain = known & (np.abs(contrast) < FAINT.least_db)
     found, left_out = list[Mass](), list[LeftOut]()
     for sign in (-1, 1):
@@ -300,7 +309,7 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
         case "behind the tissue":
             text = f"a body of {place} is left out: no tissue is seen behind it, so it may be what the tissue lies on"
         case _:
-            text = f"a dark body of {place} is left out: it is too small to be measured, or told from uneven tissue"
+            text = f"a dark body of {place} is left out: it is too small to be measured, or told from a shadow or uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text).say()
 
 

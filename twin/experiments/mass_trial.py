@@ -187,7 +187,7 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
     taken = {pair.number for pair in here}
     false = [mass for number, mass in enumerate(said.masses) if number not in taken]
     warned = [said.doubted or any(names(one, mass, said.axes) for one in said.left_out) for mass in false]
-    bodies = [one for one in said.left_out if one.reason != GAP]
+    bodies = [one for one in said.left_out if one.reason != "gap"]
     over = [pair.centre_error_mm / said.sigmas_mm[pair.number] for pair in here]
     return {
         "masses_true": len(hidden),

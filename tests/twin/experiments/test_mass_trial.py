@@ -102,7 +102,7 @@ def test_what_is_found_where_nothing_is_is_false():
 
 def test_what_is_named_where_no_mass_is_is_counted():
     """So that naming more than there is doesn't count as gain; gaps lie where they lie."""
-    left = [left_out((0.0, 0.0, 670.0)), left_out((0.0, 40.0, 670.0)), left_out((0.0, 40.0, 670.0), (9.0, 9.0, 9.0), GAP)]
+    left = [left_out((0.0, 0.0, 670.0)), left_out((0.0, 40.0, 670.0)), left_out((0.0, 40.0, 670.0), (9.0, 9.0, 9.0), "gap")]
     figures = mass_trial.judge(TRUE, Findings([ball(LARGE), ball(SMALL)], [0.1, 0.1], left, False, AXES))
     assert (figures["masses_right"], figures["named_nowhere"]) == (2, 1)
 
