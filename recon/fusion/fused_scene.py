@@ -1,6 +1,6 @@
 """Skin by light and B-scans, masses and the probe's path by ultrasound, with the devices, as layers of one scene in the world."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,7 @@ from recon.fusion.palette import IN_SPACE
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.rig import Target
+from recon.segmentation.left_out import LeftOut
 from recon.segmentation.mass_files import FoundMass
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ class FusedScene:
     masses: Mapping[str, FoundMass] | None = None  # None where none were looked for, or the search failed
     devices: Mapping[str, Camera] = field(default_factory=dict)
     search_failed: str = ""  # why the search for masses failed
+    left_out: Sequence[LeftOut] = ()  # by that search, where a mass may be missing
 
     @property
     def search(self) -> str:

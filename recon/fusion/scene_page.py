@@ -98,12 +98,19 @@ def _wires(scene: FusedScene) -> Iterator[Lines]:
 
 
 def numbers(scene: FusedScene) -> Iterator[Section]:
-    """The masses in a table, if there are any."""
+    """The masses, and what was left out, in tables, if there are any."""
     if scene.masses:
         head = ("", "centre x, y, z, mm", "volume, mm³", "below the skin, mm")
         rows = [(name, *row_of(mass)) for name, mass in scene.masses.items()]
         caption = "± one standard deviation, by poses, probe, latency, speeds of sound and speckle; of centres in space."
         yield Section("Masses", [page.table(head, rows, caption)])
+    if scene.left_out:
+        head = ("reason", "at x, y, z, mm", "seen of it, mm³", "")
+        listed = [
+            (one.reason, ", ".join(f"{v:.0f}" for v in one.centre_mm), f"{one.volume_mm3:.0f}", one.text)
+            for one in scene.left_out
+        ]
+        yield Section("Left out", [page.table(head, listed, "Where a mass may be that isn't measured.")])
 
 
 def row_of(mass: FoundMass) -> tuple[str, str, str]:

@@ -7,7 +7,7 @@ superior mean nothing here: x is to the right in camera 1's image, y down, z awa
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,8 @@ from recon.fusion.scene_page import UNKNOWN, row_of
 from recon.geometry import rigid
 from recon.segmentation.mass_files import FoundMass
 
-MARKUPS, TRANSFORM, SCRIPT, README = "masses.mrk.json", "target_to_world.tfm", "show.py", "README.txt"
+MARKUPS, LEFT_OUT, TRANSFORM = "masses.mrk.json", "left_out.mrk.json", "target_to_world.tfm"
+SCRIPT, README = "show.py", "README.txt"
 TEMPLATES = Path(__file__).parent
 
 
@@ -44,7 +45,9 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
         for name, mesh in (("target_probe", body), ("target_circles", rings)):
             meshes.write_ply(folder / f"{name}.ply", mesh)
     if scene.masses:
-        (folder / MARKUPS).write_text(json.dumps(markups(scene.masses), indent=1) + "\n", encoding="utf-8")
+        _write(folder / MARKUPS, markups(scene.masses))
+    if scene.left_out:
+        _write(folder / LEFT_OUT, _points((one.reason, one.text, one.centre_mm) for one in scene.left_out))
     shutil.copyfile(TEMPLATES / f"slicer_{SCRIPT}.txt", folder / SCRIPT)
     told = (TEMPLATES / f"slicer_{README}.txt").read_text(encoding="utf-8")
     (folder / README).write_text(f"{told}\n{scene.search}\n", encoding="utf-8")
@@ -94,13 +97,25 @@ def _itk_number(value: float) -> str:
 
 def markups(masses: Mapping[str, FoundMass]) -> dict[str, object]:
     """Control points at the masses' centres, with their figures and uncertainties, as 3D Slicer's markups."""
-    points = []
-    for number, (name, mass) in enumerate(masses.items(), 1):
+    places = []
+    for name, mass in masses.items():
         centre, volume, depth = row_of(mass)
         told = f"centre {centre} mm; volume {volume} mm3"
         told += f"; {depth} mm below the skin" if depth != UNKNOWN else ""
-        place = np.asarray(mass.mesh.center_mass).tolist()
-        points.append({"id": str(number), "label": name, "description": told, "position": place, "positionStatus": "defined"})
+        places.append((name, told, np.asarray(mass.mesh.center_mass).tolist()))
+    return _points(places)
+
+
+def _points(places: Iterable[tuple[str, str, Sequence[float]]]) -> dict[str, object]:
+    """Control points, each with its label, what is told of it and its place, mm, as 3D Slicer's markups."""
+    points = [
+        {"id": str(number), "label": label, "description": told, "position": list(place), "positionStatus": "defined"}
+        for number, (label, told, place) in enumerate(places, 1)
+    ]
     one = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": points}
     schema = "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/markups-schema-v1.0.3.json#"
     return {"@schema": schema, "markups": [one]}
+
+
+def _write(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

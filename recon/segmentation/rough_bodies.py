@@ -151,10 +151,10 @@ def rough(power: EchoPower) -> Rough:
     bodies, touching = _bodies(_opened(dark, LIMITS.open_mm, spacing), ratio, seen, spacing)
     large = [one for one in bodies if one.volume >= LIMITS.least_mm3]
     dim = dark | (seen & even & (ratio < FAINT.dark))
-    fine, _ = _bodies(_opened(dim, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(bodies, dark.shape))
+    fine, _ = _bodies(_opened(dim, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(large, dark.shape))
     small = [one for one in fine if one.volume >= LIMITS.small_mm3 and ratio[one.part][one.inside].min() <= seed]
     if even:
-        spots, _ = _bodies(dim, ratio, seen, spacing, taken=touching | _mask([*bodies, *small], dark.shape))
+        spots, _ = _bodies(dim, ratio, seen, spacing, taken=touching | _mask([*large, *small], dark.shape))
         left_out += [_leave_out("small", one, power) for one in spots if ratio[one.part][one.inside].min() <= seed]
     chosen = [one for one in large if one.core <= seed]
     left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
@@ -401,10 +401,11 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
             "cut by a gap in the sweep": _fullest(unseen & gap[part], 0),
             "cut by the images' lower end": _fullest(unseen, 1),
         }
-        above = front.sum() <= CUT.before * before.sum() and (beside & bright[part]).sum() > CUT.around * beside.sum()
-        if above:
+        covered, told = front.sum() > CUT.before * before.sum(), (beside & here).sum()
+        among = told > CUT.mostly * beside.sum() and (beside & bright[part]).sum() > CUT.around * told  # tissue
+        if not covered and among:
             sides = {"cut by the ringing at the face": 1}
-        covered = above or (front.sum() > CUT.before * before.sum() and (front & bright[part]).sum() >= CUT.mostly * front.sum())
+        covered = among if not covered else (front & bright[part]).sum() >= CUT.mostly * front.sum()
         if not any(sides.values()) or not covered:
             continue
         ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()

@@ -21,7 +21,7 @@ from recon.model.probe import Speed
 from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
 from recon.registry import Choice
-from recon.segmentation import containment, mass_files
+from recon.segmentation import containment, left_out, mass_files
 from recon.session import volume_step
 from recon.session.watch import SILENT, Watch
 
@@ -107,6 +107,7 @@ def read(settings: Settings) -> FusedScene:
     shown = fused_scene.chosen(placed, max(settings.scans, scene_page.SLIDES))
     optics = calibration_files.of_capture(settings.capture, settings.calibration)
     surface = Parted(None, None) if settings.surface is None else parted(settings, settings.surface, optics)
+    missing = () if settings.masses is None else left_out.read(settings.masses / left_out.FILE)
     return FusedScene(
         {k: sweep.image(k) for k in shown},
         scans,
@@ -116,6 +117,7 @@ def read(settings: Settings) -> FusedScene:
         surface.rest,
         None if settings.masses is None else mass_files.read_masses(settings.masses),
         {} if optics is None else optics.cameras,
+        left_out=[one for one in missing if one.reason not in left_out.UNLIKELY],
     )
 
 

@@ -20,6 +20,7 @@ from recon.fusion import fused_scene, probe_shape, scene_page, slicer_folder
 from recon.fusion.fused_scene import FusedScene
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
+from recon.segmentation.left_out import LeftOut
 from recon.segmentation.mass_files import FoundMass
 
 FIGURES = {"centre_sigma_mm": 0.21, "volume_sigma_mm3": 12.0, "depth_mm": 7.5, "depth_sigma_mm": 0.19}
@@ -33,7 +34,9 @@ def scene(rig, rng) -> FusedScene:
     images = {k: rng.integers(0, 256, (40, 30), dtype=np.uint8) for k in (0, 2, 4)}
     ball = trimesh.creation.icosphere(3, 5.0).apply_translation([10, -20, 660])
     skin = trimesh.creation.icosphere(3, 50.0).apply_translation([0, 0, 690])
-    return FusedScene(images, scans, poses, rig.target, skin, None, {"mass0": FoundMass(ball, FIGURES)})
+    missing = LeftOut(reason="small", volume_mm3=4.0, centre_mm=(1.0, 2.0, 660.0), extents_mm=(2.0, 2.0, 2.0), text="is left out")
+    masses = {"mass0": FoundMass(ball, FIGURES)}
+    return FusedScene(images, scans, poses, rig.target, skin, None, masses, left_out=[missing])
 
 
 @pytest.fixture
@@ -46,8 +49,16 @@ def folder(scene, tmp_path):
 def test_everything_is_there(folder):
     assert {path.name for path in folder.iterdir()} == {
         "skin.ply", "mass0.ply", "path.ply", "volume.nrrd", "scan0000.nrrd", "scan0004.nrrd", "target_probe.ply",
-        "target_circles.ply", "target_to_world.tfm", "masses.mrk.json", "show.py", "README.txt",
+        "target_circles.ply", "target_to_world.tfm", "masses.mrk.json", "left_out.mrk.json", "show.py", "README.txt",
     }  # fmt: skip
+
+
+def test_what_was_left_out_is_a_point_with_its_reason(folder, scene):
+    """In the folder for 3D Slicer, and in the page's table."""
+    (point,) = json.loads((folder / "left_out.mrk.json").read_text(encoding="utf-8"))["markups"][0]["controlPoints"]
+    assert (point["label"], point["description"], point["position"]) == ("small", "is left out", [1.0, 2.0, 660.0])
+    _, table = scene_page.numbers(scene)
+    assert table.title == "Left out" and "1, 2, 660" in str(table)
 
 
 def test_a_b_scan_is_a_slice_where_it_was_taken(folder, scene):

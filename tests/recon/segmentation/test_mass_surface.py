@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Grid
 from recon.segmentation import mass_surface
 from recon.segmentation.mass_surface import Mass
+from scenes.mass_forms import mass
 
 CENTRE, RADIUS = np.array([3.0, 698.0, 14.0]), 5.0
 
@@ -45,3 +47,29 @@ def test_the_largest_of_several_surfaces_is_taken():
     mesh = mass_surface.meshed(np.minimum(*balls), 0.0, 3 * (slice(0, None),), volume, outside=5.0)
     assert mesh.is_watertight and mesh.volume == pytest.approx(4 / 3 * np.pi * 4.0**3, rel=0.02)
     np.testing.assert_allclose(mesh.center_mass, [15, 0, 0], atol=0.01)
+
+
+@pytest.mark.parametrize("form", ["round", "oval", "lobulated", "irregular", "spiculated"])
+@pytest.mark.parametrize("size_mm", [10.0, 25.0])
+def test_a_mass_of_one_form_is_one(form, size_mm, rng):
+    """However many lobes and spikes it has."""
+    for _ in range(3):
+        one = Mass(mass(form, size_mm, rng))
+        assert mass_surface.parted(one, np.eye(3)) == [one]
+
+
+@pytest.mark.parametrize("sizes_mm", [(12.0, 12.0), (14.0, 10.0)])
+def test_two_masses_that_touch_are_parted_at_their_waist(sizes_mm, rng):
+    """Their borders run into each other over 0.5 mm, as the blur of B-scans has it."""
+    one, other = (mass("lobulated", size, rng) for size in sizes_mm)
+    other.apply_translation([one.vertices[:, 0].max() - other.vertices[:, 0].min() - 1.0, 0.0, 0.0])
+    step = 0.4
+    grid = mass_surface.grid_over(np.vstack([one.vertices, other.vertices]), np.eye(3), np.full(3, step), 3.0)
+    near = np.minimum(*(mass_surface.distances([Mass(body)], grid).voxels for body in (one, other)))
+    joined = Volume(ndimage.gaussian_filter(near, 0.5 / step), grid.origin, grid.spacing, grid.directions)
+    whole = Mass(mass_surface.meshed(joined.voxels, 0.0, 3 * (slice(0, None),), joined, outside=5.0))
+    parts = mass_surface.parted(whole, np.eye(3))
+    assert len(parts) == 2 and all(part.beside and part.mesh.is_watertight for part in parts)
+    for part, true in zip(parts, sorted((one, other), key=lambda body: -body.volume), strict=True):
+        assert part.volume == pytest.approx(true.volume, rel=0.12)
+        assert np.linalg.norm(part.centre - true.center_mass) < 0.5

@@ -1,0 +1,130 @@
+"""Are bright, faint, small and shadowing bodies found, or named with their reasons, in even and in uneven tissue?"""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+from scipy.special import ndtr
+
+from recon.files.volumes import Volume
+from recon.segmentation import left_out, masses, rough_bodies
+from recon.segmentation.echo_power import EchoPower
+
+SPACING = np.array(masses.SPACING_MM)
+SIZE = (np.array([36, 36, 32]) / SPACING).astype(int)  # nx, ny, nz
+CENTRE = np.array([3.0, 698.0, 14.0])
+ORIGIN = CENTRE - [18.0, 14.0, 16.0]
+LOOKS = 24 * SPACING.prod()  # independent cells of speckle in a voxel
+REFINEMENTS = sum(masses.REFINEMENTS)
+PLACES = ORIGIN + SPACING * np.moveaxis(np.mgrid[: SIZE[2], : SIZE[1], : SIZE[0]][::-1], 0, -1)
+
+
+def away(radius: float, centre=CENTRE) -> np.ndarray:
+    """Distance of all voxels from a ball's surface, mm."""
+    return np.linalg.norm(PLACES - centre, axis=-1) - radius
+
+
+def tissue(radius: float, level: float, centre=CENTRE) -> np.ndarray:
+    """Mean power of tissue with a ball of another one, blurred over 0.3 mm."""
+    return level + (1 - level) * ndtr(away(radius, centre) / 0.3)
+
+
+def speckled(mean, rng) -> EchoPower:
+    voxels = (mean * rng.gamma(LOOKS, 1 / LOOKS, mean.shape)).astype(np.float32)
+    return EchoPower(Volume(voxels, ORIGIN, SPACING), np.full(mean.shape, LOOKS, np.float32))
+
+
+def lobules(rng) -> np.ndarray:
+    """Power of tissue of fat and gland, 8 dB apart, in lobules of some 10 mm."""
+    return 10 ** (0.4 * np.sign(ndimage.gaussian_filter(rng.normal(size=PLACES.shape[:3]), 4 / SPACING[::-1])))
+
+
+def volume_of(radius: float) -> float:
+    return 4 / 3 * np.pi * radius**3
+
+
+@pytest.mark.parametrize("level", [4.0, 0.45])
+def test_a_bright_and_a_faint_ball_are_as_large_as_they_are(level, rng):
+    """6 dB above and 3.5 dB below the tissue; 0.2 mm of a border in speckle is 12 % of a ball of 5 mm."""
+    power = speckled(tissue(5.0, level), rng)
+    first = rough_bodies.rough(power)
+    assert first.even and not first.masses
+    (found,) = rough_bodies.faint(power, [], first.hidden).masses
+    assert found.bright == (level > 1)
+    (mass,) = masses.refined([found], power, REFINEMENTS)
+    assert mass.volume == pytest.approx(volume_of(5.0), rel=0.06 if level > 1 else 0.12)
+    assert np.linalg.norm(mass.centre - CENTRE) < (0.1 if level > 1 else 0.3)
+    assert masses._stands_out(mass, power)
+
+
+def test_even_tissue_alone_holds_nothing(rng):
+    power = speckled(np.ones(PLACES.shape[:3]), rng)
+    first = rough_bodies.rough(power)
+    assert first.even and not first.masses and not first.left_out
+    assert rough_bodies.faint(power, [], first.hidden) == ([], [])
+
+
+def test_a_body_of_weak_contrast_is_found_in_even_tissue_and_named_in_uneven(rng):
+    """7 dB below; what it lies in has lobules as dark."""
+    (mass,) = rough_bodies.rough(speckled(tissue(5.0, 0.2), rng)).masses
+    assert mass.volume == pytest.approx(volume_of(5.0), rel=0.3)  # roughly
+    first = rough_bodies.rough(speckled(np.where(away(5.0) < 0, 0.2, lobules(rng)), rng))
+    named = [one for one in first.left_out if one.reason == "weak contrast"]
+    assert not first.even and any(np.linalg.norm(np.array(one.centre_mm) - CENTRE) < 2 for one in named)
+
+
+def test_small_balls_are_found_or_named_by_their_size(rng):
+    """5 mm in diameter, and 2.8 mm."""
+    power = speckled(tissue(2.5, 0.05), rng)
+    (found,) = rough_bodies.rough(power).masses
+    (mass,) = masses.refined([found], power, REFINEMENTS)
+    assert mass.volume == pytest.approx(volume_of(2.5), rel=0.15) and np.linalg.norm(mass.centre - CENTRE) < 0.15
+    first = rough_bodies.rough(speckled(tissue(1.4, 0.02), rng))
+    (one,) = first.left_out
+    assert not first.masses and one.reason == "small" and np.linalg.norm(np.array(one.centre_mm) - CENTRE) < 0.5
+
+
+def test_noise_in_fluid_is_no_rise_behind_it(rng):
+    """Power of fluid without echoes is noise, by 10 dB more in its lower half."""
+    noise = np.where(PLACES[..., 1] < CENTRE[1], 1e-4, 1e-3)
+    mean = noise + (1 - noise) * ndtr(away(6.0) / 0.3)
+    power = speckled(mean, rng)
+    (mass,) = masses.refined(rough_bodies.rough(power).masses, power, REFINEMENTS)
+    assert mass.volume == pytest.approx(volume_of(6.0), rel=0.04)
+
+
+def test_a_body_whose_shadow_reaches_the_dark_behind_the_tissue_is_named_at_its_place(rng):
+    """The dark begins 30 mm deep, and the shadow of a ball half as deep joins it."""
+    places = PLACES - CENTRE
+    shadow = (np.hypot(places[..., 0], places[..., 2]) < 5) & (places[..., 1] > 0)
+    mean = np.where(shadow | (places[..., 1] > 16), 0.02, tissue(5.0, 0.02))
+    first = rough_bodies.rough(speckled(mean, rng))
+    (one,) = [one for one in first.left_out if one.reason == "its shadow hides its back"]
+    assert not first.masses and np.linalg.norm(np.array(one.centre_mm) - CENTRE) < 2.0
+    plain = rough_bodies.rough(speckled(np.where(places[..., 1] > 16, 0.02, 1.0), rng))
+    assert not any(one.reason == "its shadow hides its back" for one in plain.left_out)
+
+
+def test_a_body_that_begins_at_the_face_is_named_so_and_gel_isnt(rng):
+    """Tissue is on both sides of the one; the other is dark all along the face."""
+    top = CENTRE - [0.0, 14.0, 0.0]
+    (one,) = rough_bodies.rough(speckled(tissue(4.0, 0.03, top), rng)).left_out
+    assert one.reason == "cut by the ringing at the face" and one.text.endswith("scan there through more gel")
+    gel = np.where(PLACES[..., 1] < top[1] + 4 + PLACES[..., 0] / 8, 0.01, 1.0)
+    assert not [one for one in rough_bodies.rough(speckled(gel, rng)).left_out if one.reason not in left_out.UNLIKELY]
+
+
+def test_what_is_bright_with_nothing_behind_it_is_what_the_tissue_lies_on(rng):
+    """A table that shines, 6 mm thick in B-scans, in part of the scan."""
+    places = PLACES - CENTRE
+    table = (places[..., 1] > 8) & (places[..., 1] < 14) & (np.abs(places[..., 0]) < 9) & (np.abs(places[..., 2]) < 9)
+    mean = np.where(table, 4.0, np.where(places[..., 1] >= 14, 0.02, 1.0))
+    power = speckled(mean, rng)
+    found = rough_bodies.faint(power, [], rough_bodies.rough(power).hidden)
+    assert not found.masses and [one.reason for one in found.left_out] == ["behind the tissue"]
+
+
+def test_what_was_left_out_is_read_back(rng, tmp_path):
+    """And nothing of a folder that has no such file."""
+    found = tuple(rough_bodies.rough(speckled(tissue(1.4, 0.02), rng)).left_out)
+    left_out.write(tmp_path / left_out.FILE, found)
+    assert left_out.read(tmp_path / left_out.FILE) == found and left_out.read(tmp_path / "other.json") == ()
