@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -187,6 +188,7 @@ class Scans:
     errors: PlaceErrors | None = None  # of their places; None where nothing is known of them
     elsewhere: bool = False  # 3D Slicer shows their sequence elsewhere than results in the world
     left_out: int = 0  # poses of their track that no hand makes
+    times_s: Array | None = None  # (n,) when they were taken, by their own clock; None where it isn't known
 
     @property
     def placed(self) -> int:
@@ -231,7 +233,8 @@ def of_sweep(
         covariance is not None,
     )
     placed = sweep.poses(lag_s) @ target_from_pixel
-    return Scans(sweep.size[::-1], placed, sweep.images, converted.speed_m_s, probe.speed_m_s, converted, errors)
+    times_s = (sweep.times - sweep.times[:1]) * 1e-9
+    return Scans(sweep.size[::-1], placed, sweep.images, converted.speed_m_s, probe.speed_m_s, converted, errors, times_s=times_s)
 
 
 def of_sequence(
@@ -280,7 +283,8 @@ def of_sequence(
     )
     converted = None if probe is None else sound_in_water.for_tissue(probe, tissue_m_s)
     elsewhere = sequences.lies_elsewhere(frames, reference)
-    return Scans(shape, matrices, lambda: sequences.stream_images(path), speed, calibrated, converted, None, elsewhere, left_out)
+    images = partial(sequences.stream_images, path)
+    return Scans(shape, matrices, images, speed, calibrated, converted, None, elsewhere, left_out, frames.times_s)
 
 
 def cut(scans: Scans, clip: Clip) -> Scans:

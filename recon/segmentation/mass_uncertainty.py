@@ -1,4 +1,5 @@
-"""Uncertainty of a mass's place, volume and depth below the skin, by what places its B-scans, by sound, and by its border.
+"""Uncertainty of a mass's place, volume and depth below the skin, by what places its B-scans, by sound, by
+what moved the tissue, and by its border.
 
 The poses of the track move the B-scans that lie beside them; the probe's calibration, the latency and tolerances of the tracking
 move all of them together, and with them the border that they show. Where several B-scans show a point, it moves by the mean of
@@ -21,6 +22,7 @@ from recon.geometry import rigid
 from recon.model.probe import NAMES
 from recon.segmentation.containment import Containment
 from recon.segmentation.mass_surface import Mass
+from recon.segmentation.rest import Rest
 
 Array = NDArray[np.float64]
 
@@ -35,6 +37,7 @@ class Sigma(NamedTuple):
     centre_mm: float  # as a distance in space
     volume_mm3: float
     depth_mm: float = np.nan  # of its least depth below the skin; NaN without one
+    left_mm: float = np.nan  # of its centre, by pressure and breath that may be left alone; NaN where these aren't known
 
 
 class Speeds(NamedTuple):
@@ -68,18 +71,21 @@ class Weights:
         return np.concatenate([self.centre, self.volume[:, None], self.depth[:, None]], axis=1)
 
 
-def by_all(mass: Mass, scans: Scans, speeds: Speeds, under: Containment | None = None) -> Sigma:
+def by_all(mass: Mass, scans: Scans, speeds: Speeds, under: Containment | None = None, rest: Rest | None = None) -> Sigma:
     """By all of these, which err independently; NaN without the calibration's covariance.
 
     under : the mass's containment in the skin, if there is one.
+    rest : what was undone in the B-scans, if that is known.
     """
-    if scans.probe is None or scans.probe.uncertainty is None:
-        return Sigma(np.nan, np.nan)
     weights, shown = weights_of(mass, under), shown_by(np.asarray(mass.mesh.vertices), scans)
+    by_motion = np.zeros((5, 5)) if rest is None else by_rest(weights, shown, rest)
+    left_mm = np.nan if rest is None else float(np.sqrt(np.trace(by_motion[:3, :3])))
+    if scans.probe is None or scans.probe.uncertainty is None:
+        return Sigma(np.nan, np.nan, left_mm=left_mm)
     covariance = _by_placing(weights, shown, scans) + by_speeds(mass, weights, shown, scans, speeds) + _by_border(mass, under)
-    centre, volume, depth = np.trace(covariance[:3, :3]), covariance[3, 3], covariance[4, 4]
-    depth = np.nan if under is None or not np.isfinite(under.least_mm) else depth
-    return Sigma(*np.sqrt([centre, volume, depth]).tolist())
+    covariance += by_motion
+    centre, volume, depth = np.sqrt([np.trace(covariance[:3, :3]), covariance[3, 3], covariance[4, 4]]).tolist()
+    return Sigma(centre, volume, np.nan if under is None or not np.isfinite(under.least_mm) else depth, left_mm)
 
 
 def weights_of(mass: Mass, under: Containment | None = None) -> Weights:
@@ -147,6 +153,13 @@ def by_speeds(mass: Mass, weights: Weights, shown: Shown, scans: Scans, speeds: 
     by_tissue = np.concatenate([along * (depth - half), [0.0], deeper[4:]])
     by_within = np.concatenate([along * half, [mass.volume], [0.0]])
     return np.outer(by_tissue, by_tissue) * speeds.tissue**2 + np.outer(by_within, by_within) * speeds.within**2
+
+
+def by_rest(weights: Weights, shown: Shown, rest: Rest) -> Array:
+    """Covariance : (5, 5) of centre, volume and depth by what may be left of motions; each cause errs alike in all B-scans."""
+    moved = rest.unknown(shown.scan, shown.pixel) * shown.share[:, None]
+    by_cause = np.einsum("mfi,kmi->kf", weights.rows[shown.vertex], moved)
+    return by_cause.T @ by_cause
 
 
 def _by_border(mass: Mass, under: Containment | None) -> Array:

@@ -14,7 +14,7 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.geometry.primitives import Cylinder
 from recon.model.probe import SCANNER_SPEED
-from recon.segmentation import contact, mass_uncertainty, masses, scan_overlays, tube_cover, tube_wall
+from recon.segmentation import contact, mass_uncertainty, masses, rest, scan_overlays, tube_cover, tube_wall
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
@@ -60,6 +60,12 @@ def find_masses(
         As `recon.segmentation.masses.from_scans`.
     """
     scans = freehand_scans.in_memory(scans)  # they are read five times and more
+    touching = moved = None
+    if skin is not None:
+        touching = contact.measure(scans, skin)
+        moved = rest.find(scans, skin, touching)
+    if moved is not None:
+        scans = freehand_scans.in_memory(rest.undone(scans, moved))
     sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
     found = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
@@ -67,16 +73,18 @@ def find_masses(
     none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
     lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
     lines += [f"blur        {blur}"] if blur is not None and found else []
-    if skin is not None:
-        touching = contact.measure(scans, skin)
-        figures |= touching.figures
-        lines += touching.lines
+    for one in (touching, moved):
+        figures |= {} if one is None else one.figures
+        lines += [] if one is None else one.lines
     containments = [None] * len(found) if skin is None else contain([mass.mesh for mass in found], skin)
     for number, (mass, under) in enumerate(zip(found, containments, strict=True)):
         speeds = Speeds(speed_sigmas[0] / scans.speed_m_s, speed_sigmas[1] / mass_m_s)
-        sigma = mass_uncertainty.by_all(mass, scans, speeds, under)
+        sigma = mass_uncertainty.by_all(mass, scans, speeds, under, moved)
         figures |= measure(f"mass{number}", mass, sigma, under)
         lines.append(f"mass{number}       {describe(mass, sigma, under)}")
+        if moved is not None:
+            figures[f"mass{number}_left_sigma_mm"] = sigma.left_mm
+            lines += rest.warnings_of(f"mass{number}", sigma.left_mm)
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
     return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn)
 
@@ -100,7 +108,7 @@ def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> M
 def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
     """One line: volume, centre and extent of a mass, and its depth below the skin."""
     centre = ", ".join(f"{value:.1f}" for value in mass.centre)
-    known = zip(sigma, (".1f", ".0f", ".2f"), strict=True)
+    known = zip(sigma[:3], (".1f", ".0f", ".2f"), strict=True)
     away, volume, deep = (f" ± {value:{how}}" if np.isfinite(value) else "" for value, how in known)
     extent = " x ".join(f"{value:.1f}" for value in mass.mesh.extents)
     text = f"{mass.volume:.0f}{volume} mm3, centre {centre}{away} mm, {extent} mm"

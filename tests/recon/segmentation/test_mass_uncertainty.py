@@ -17,6 +17,7 @@ from recon.segmentation import mass_uncertainty
 from recon.segmentation.containment import contain, read_skin
 from recon.segmentation.mass_surface import Mass
 from recon.segmentation.mass_uncertainty import Speeds
+from recon.segmentation.rest import LIMITS, NODES, Rest
 from scenes.solid_meshes import grid
 
 STILL = Speeds(0.0, 0.0)
@@ -67,6 +68,28 @@ def test_a_speed_in_the_mass_that_is_uncertain_by_2_percent(rig):
     centre, volume = by_speeds(mass, scans, 0.0, 0.02)
     assert volume == pytest.approx(0.02 * mass.volume, rel=1e-6)
     assert centre == pytest.approx(0.02 * RADIUS_MM, rel=0.02)
+
+
+def test_what_was_undone_is_uncertain_by_its_shares(rig):
+    """Tissue that was pressed down by 1.2 mm at the mass, less by 5 % of each mm below, aside by none, and had risen by 2 mm.
+
+    Its centre is uncertain by shares of these, along the beam and twice aside, and its volume by the share of 5 % (closed form).
+    """
+    scans, mass = sweep(probe_of(rig))
+    count, down = len(scans.world_from_pixel), SCALE[1] * np.linspace(0, SIZE[1] - 1, NODES[0])
+    fields = np.zeros((count, *NODES, 2), np.float32)
+    fields[..., 1] = (1.2 - 0.05 * (down - DEPTH_MM))[:, None]
+    axes = scans.world_from_pixel[:, :3, :3] / np.linalg.norm(scans.world_from_pixel[:, :3, :3], axis=1, keepdims=True)
+    risen, pressed, nothing = np.full(count, 2.0), np.full(count, 2.5), np.zeros(count)
+    scale = float(SCALE[0]), float(SCALE[1])
+    moved = Rest(risen, pressed, -axes[0, :, 1], fields, axes, SIZE[::-1], scale, nothing, 0.0, nothing, None)
+    weights, shown = mass_uncertainty.weights_of(mass), mass_uncertainty.shown_by(np.asarray(mass.mesh.vertices), scans)
+    found = mass_uncertainty.by_rest(weights, shown, moved)
+    along = np.hypot(1.2 * LIMITS.law, 2.0 * LIMITS.risen)
+    expected = np.linalg.norm([along, 1.2 * LIMITS.aside, 1.2 * LIMITS.aside])
+    assert np.sqrt(np.trace(found[:3, :3])) == pytest.approx(expected, rel=0.01)
+    assert axes[0, :, 1] @ found[:3, :3] @ axes[0, :, 1] == pytest.approx(along**2, rel=0.02)
+    assert np.sqrt(found[3, 3]) == pytest.approx(0.05 * LIMITS.law * mass.volume, rel=0.02)
 
 
 def test_between_b_scans_that_are_far_apart_the_next_one_counts(rig, sharp):
