@@ -79,7 +79,7 @@ class Rest:
     risen_mm: Array  # (n,) of the body, along `up`
     pressed_mm: Array  # (n,) to which the face pressed the skin in
     up: Array  # (3,) unit, in the world: the chest's normal, towards the camera
-    fields: NDArray[np.float32]  # (n, *NODES, 2) mm along array and beam, from where a pixel's tissue rests to where it lay
+    fields: NDArray[np.float32]  # (n, *NODES, 2) mm along array and beam, from where tissue rests to where it lay; over `undone`
     axes: Array  # (n, 3, 3) unit, in the world: columns along the array, the beam and across both
     shape: tuple[int, int]  # of the B-scans
     scale: tuple[float, float]  # mm a pixel
@@ -161,7 +161,7 @@ def find(scans: Scans, skin: trimesh.Trimesh, touching: Contact) -> Rest | None:
     patches = _patches(scans.shape[1], scale[0])
     depths, normals, origins = _within(scans, skin, placed, axes, patches)
     shares = np.clip(normals @ up, 0.3, 1.0)
-    known = scans.times_s is not None and np.isfinite(scans.times_s).all()
+    known = scans.times_s is not None and (np.diff(scans.times_s) > 0).all()
     times_s = scans.times_s if known else np.arange(len(placed)) / RATE_HZ
     contact_mm = touching.sigma_mm if np.isfinite(touching.sigma_mm) else contact.LIMITS.given_mm
     least_mm = max(LIMITS.least_mm, LIMITS.least_sigma * contact_mm)
@@ -185,12 +185,16 @@ def find(scans: Scans, skin: trimesh.Trimesh, touching: Contact) -> Rest | None:
 
 
 def undone(scans: Scans, rest: Rest) -> Scans:
-    """The B-scans as of tissue at rest: what each pixel shows is put where it rests, in planes that breath has moved back."""
+    """The B-scans as of tissue at rest: what each pixel shows is put where it rests, in planes that breath has moved back.
+
+    They begin at the skin at rest, or the tissue that was pressed together below it would be lost.
+    """
     if not rest.moved.any():
         return scans
-    back = np.tile(np.eye(4), (len(scans.world_from_pixel), 1, 1))
+    back, began = np.tile(np.eye(4), (2, len(scans.world_from_pixel), 1, 1))
     back[:, :3, 3] = -rest.risen_mm[:, None] * rest.up
-    return replace(scans, world_from_pixel=back @ scans.world_from_pixel, stream=partial(_stream, scans, rest))
+    began[:, 1, 3] = -rest.pressed_mm / rest.scale[1]
+    return replace(scans, world_from_pixel=back @ scans.world_from_pixel @ began, stream=partial(_stream, scans, rest))
 
 
 def warnings_of(name: str, left_mm: float) -> list[str]:
@@ -212,7 +216,8 @@ def _stream(scans: Scans, rest: Rest) -> Iterator[Image]:
     def at_rest(image: Image, field: NDArray[np.float32], pressed: float) -> Image:
         if pressed == 0:
             return image
-        lay = pixels + cv2.warpAffine(field / np.float32(rest.scale), node_from_pixel, (width, height), **between)
+        shift = (field - np.float32([0, pressed])) / np.float32(rest.scale)
+        lay = pixels + cv2.warpAffine(shift, node_from_pixel, (width, height), **between)
         return cv2.remap(image, lay, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
 
     return threads.mapped(at_rest, scans.stream(), rest.fields, rest.pressed_mm.tolist())
@@ -290,7 +295,7 @@ def _fields(
         above = np.interp(x, patches.x[middle], np.maximum(depths[k, middle], -FAR_MM))  # the skin at rest, of the face
         for axis, moved in enumerate((response.along @ force, response.down @ force)):
             found[k, :, :, axis] = np.stack(
-                [np.interp(z + lifted, DEPTHS_MM, one) for lifted, one in zip(above, moved, strict=True)], axis=1
+                [np.interp(z - pressed[k] + lifted, DEPTHS_MM, one) for lifted, one in zip(above, moved, strict=True)], axis=1
             )
     return found
 

@@ -82,11 +82,16 @@ def test_what_is_pressed_down_is_put_back_up(skin, rng):
     scans = sweep(-2.0, tissue(rng))
     moved = found_in(scans, skin)
     assert moved.pressed_mm == pytest.approx(np.full(COUNT, 2.0), abs=0.02) and not moved.risen_mm.any()
-    images = list(rest.undone(scans, moved).stream())
+    back = rest.undone(scans, moved)
+    images = list(back.stream())
     assert len(images) == COUNT
-    shown, rests = spot(tissue(rng)), spot(images[70])
-    lifted = SCALE[1] * (shown - rests)
+    rests = spot(images[70])
+    places = [
+        rigid.apply(one.world_from_pixel[70], [160.0, row, 0.0]) for one, row in ((scans, spot(tissue(rng))), (back, rests))
+    ]
+    lifted = places[0][2] - places[1][2]
     assert 0.7 < lifted < 1.3
+    assert rigid.apply(back.world_from_pixel[70], [160.0, 0, 0])[2] == pytest.approx(DEPTH_MM, abs=0.02)  # from the skin on
     down = moved.pressed_at(np.array([70]), np.array([[160.0, rests]]))[0]
     assert down == pytest.approx([0, 0, lifted], abs=SCALE[1])
 
@@ -151,7 +156,11 @@ def test_pressed_masses_are_found_as_they_rest(rig: Rig):
     """
     scene = {"kind": "breast", "nipple_height_mm": 1.5, "size_mm": [170.0, 130.0, 49.5]}
     path = mass_accuracy.PATH.model_copy(update={"standoff_mm": -2.0})
-    planned = plan_sweep(SweepSettings(rig=rig, scene=scene, path=path, living=Living(yields=True, element_mm=5.0), seed=3))
+    planned = plan_sweep(
+        SweepSettings(
+            rig=rig, scene=scene, ultrasound=Transducer(), path=path, living=Living(yields=True, element_mm=5.0), seed=3
+        )
+    )
     images = [one.image for one in planned.scans()]
     clocks, plan = planned.settings.clocks, planned.plan
     known = Uncertainty(NAMES, np.diag([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 0.07, 0.07, 0.07]) ** 2)
