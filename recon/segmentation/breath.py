@@ -63,6 +63,8 @@ def part(times_s: Array, distances: Array, shares: Array) -> Parts:
     known = np.isfinite(distances)
     near = median_filter(np.interp(times_s, times_s[known], distances[known]), COURSE.neighbours)
     used = np.flatnonzero(np.abs(distances - near) < COURSE.outlier_mm)
+    if not len(used):
+        return Parts(np.zeros(len(distances)), near, np.zeros(len(distances)), None)
     bins = np.array_split(used, min(len(used), COURSE.most))
     t, y, share = (np.array([values[one].mean() for one in bins]) for values in (times_s, distances, shares))
     apart, mean = t[:, None] - t, float(np.median(y))

@@ -21,6 +21,7 @@ Reason = Literal[
     "cut by a gap in the sweep",
     "cut by the ringing at the face",
     "its shadow hides its back",
+    "in the shadow of a mass",
     "behind a cut body",
     "streak down the beam",
     "weak contrast",

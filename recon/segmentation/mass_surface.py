@@ -69,21 +69,27 @@ def parted(mass: Mass, axes: Array) -> list[Mass]:
     from one to the other, and whose waist is narrower than the thinner one by `narrower`. Masses of one form, be it lobulated or
     spiculated, have no such waist.
     """
-    waist_mm, narrower, least_mm3, mesh_mm = 0.6, 0.85, 50.0, 0.3
+    waist_mm, narrower, least_mm3 = 0.6, 0.85, 50.0
+    mesh_mm = max(0.3, float(np.max(mass.mesh.extents)) / 100)
     near = distances([mass], grid_over(mass.mesh.vertices, axes, np.full(3, mesh_mm), NEAR_MM))
     inside = near.voxels < 0
     deep = np.asarray(ndimage.distance_transform_edt(inside)) * mesh_mm
     middles, count = ndimage.label(local_maxima(reconstruction(np.maximum(deep - waist_mm, 0), deep)))
-    if count < 2:
-        return [mass]
-    bodies, numbers, whole = watershed(-deep, middles, mask=inside), range(1, count + 1), 3 * (slice(0, None),)
-    beside = np.array([deep[ndimage.binary_dilation(bodies == k) & (bodies > 0) & (bodies != k)].max() for k in numbers])
-    volumes = np.bincount(bodies.ravel())[1:] * mesh_mm**3
-    if (beside > narrower * ndimage.maximum(deep, bodies, numbers)).any() or volumes.min() < least_mm3:
-        return [mass]
-    fields = (np.where((bodies == 0) | (bodies == k), near.voxels, mesh_mm / 2) for k in numbers)
-    parts = [replace(mass, mesh=meshed(field, 0.0, whole, near, outside=FAR_MM), beside=True) for field in fields]
-    return sorted(parts, key=lambda one: -one.volume)
+    while count > 1:
+        bodies, numbers = watershed(-deep, middles, mask=inside), range(1, count + 1)
+        waists = np.array(
+            [deep[ndimage.binary_dilation(bodies == k) & (bodies > 0) & (bodies != k)].max(initial=0) for k in numbers]
+        )
+        volumes = np.bincount(bodies.ravel(), minlength=count + 1)[1:] * mesh_mm**3
+        one = (waists > narrower * ndimage.maximum(deep, bodies, numbers)) | (volumes < least_mm3)
+        if not one.any():
+            whole = 3 * (slice(0, None),)
+            fields = (np.where((bodies == 0) | (bodies == k), near.voxels, mesh_mm / 2) for k in numbers)
+            parts = [replace(mass, mesh=meshed(field, 0.0, whole, near, outside=FAR_MM), beside=True) for field in fields]
+            return sorted(parts, key=lambda part: -part.volume)
+        middles[middles == 1 + np.where(one, volumes, np.inf).argmin()] = 0  # the smallest goes to its neighbour
+        middles, count = ndimage.label(middles > 0)
+    return [mass]
 
 
 def _around(mass: Mass, lattice: Volume) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

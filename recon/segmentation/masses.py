@@ -17,7 +17,7 @@ from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.left_out import LeftOut, Reason
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
-from recon.segmentation.rough_bodies import LIMITS, Found, faint, rough
+from recon.segmentation.rough_bodies import FAINT, LIMITS, Found, faint, rough, say
 from recon.segmentation.shadow_clearing import Recording, cleared, passed
 
 Array = NDArray[np.float64]
@@ -77,28 +77,29 @@ def from_scans(
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
     first = rough(power)
-    bright = [mass for mass in faint(power, [], first.hidden).masses if mass.bright] if first.even else []
-    masses, left_out = refined([*first.masses, *bright], power, roughly), first.left_out
+    even = first.uneven_db < FAINT.even_db
+    bright = faint(power, [], first.hidden, signs=(1,)).masses if even else []
+    masses, left_out = refined([*first.masses, *bright], power, roughly), list[LeftOut]()
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            left_out += [_shadow(mass) for mass in masses if _is_shadow(mass, power)]
+            left_out += [_shadow(mass, power) for mass in masses if _is_shadow(mass, power)]
             masses = refined([mass for mass in masses if not _is_shadow(mass, power)], power, times)
-    more = faint(power, masses, first.hidden) if first.even else Found([], [])
+    more = faint(power, masses, first.hidden) if even else Found([], [])
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
-        left_out += [_shadow(mass) for mass in masses if _is_shadow(mass, power)]
+        left_out += [_shadow(mass, power) for mass in masses if _is_shadow(mass, power)]
         masses = [mass for mass in masses if not _is_shadow(mass, power)]
         masses += refined(more.masses, power, sum(REFINEMENTS))
     kept = list[Mass]()
-    for mass in masses:
-        if passed(recording, grid, mass, sound) < LIMITS.passed:
-            left_out.append(_left_out("its shadow hides its back", mass, "all behind it is dark, so its back isn't seen"))
+    for number, mass in enumerate(masses):
+        if passed(recording, grid, masses, number, sound) < LIMITS.passed:
+            left_out.append(_left_out("its shadow hides its back", mass, power, "all behind it is dark, so its back isn't seen"))
         elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
-            left_out.append(_left_out("weak contrast", mass, "it may be the shadow of another, or that one its"))
-        elif first.even and not _stands_out(mass, power):
-            left_out.append(_left_out("weak contrast", mass, "it hardly differs from the tissue around"))
+            left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
+        elif even and not _stands_out(mass, power):
+            left_out.append(_left_out("weak contrast", mass, power, "it hardly differs from the tissue around"))
         else:
             kept.append(mass)
     masses = kept
@@ -106,7 +107,8 @@ def from_scans(
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     masses = [part for mass in masses for part in parted(mass, power.volume.directions)]
-    return Found(sorted(masses, key=lambda mass: -mass.volume), left_out)
+    say(left_out)
+    return Found(sorted(masses, key=lambda mass: -mass.volume), first.left_out + left_out, first.uneven_db)
 
 
 def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
@@ -148,14 +150,20 @@ def _is_shadow(mass: Mass, power: EchoPower) -> bool:
 
 
 def _stands_out(mass: Mass, power: EchoPower) -> bool:
-    """Whether a mass differs from the tissue on all its sides, by half of what it does as a whole."""
-    beside_mm = (1.0, 1.5, 2.0, 2.5)  # of its border
+    """Whether a mass differs from the tissue on all its sides that are seen, by half of what it does as a whole."""
+    beside_mm, least = (1.0, 1.5, 2.0, 2.5), 20  # of its border; samples of a side
     vertices, away = np.asarray(mass.mesh.vertices), np.asarray(mass.mesh.vertex_normals)
-    outside, inside = ([_sampled(power, vertices + side * mm * away) for mm in beside_mm] for side in (1, -1))
-    sides = (away > 0) @ [1, 2, 4]  # octants
-    steps = [np.nanmean(np.array(outside)[:, sides == k]) - np.nanmean(np.array(inside)[:, sides == k]) for k in np.unique(sides)]
-    whole = float(np.nanmean(outside) - np.nanmean(inside))
-    return (whole < 0) == mass.bright and bool(np.nanmin(np.array(steps) / whole) > 0.5)
+    outside, inside = (np.array([_sampled(power, vertices + side * mm * away) for mm in beside_mm]) for side in (1, -1))
+    sides = (away @ power.volume.directions > 0) @ [1, 2, 4]  # octants
+    steps = list[float]()
+    for chosen in (sides >= 0, *(sides == k for k in range(8))):
+        pairs = [values[:, chosen][np.isfinite(values[:, chosen])] for values in (outside, inside)]
+        if min(map(len, pairs)) >= least:
+            steps.append(float(pairs[0].mean() - pairs[1].mean()))
+    if len(steps) < 2:
+        return False
+    whole, *each = steps
+    return (whole < 0) == mass.bright and min(step / whole for step in each) > 0.5
 
 
 def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:
@@ -165,8 +173,10 @@ def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:
     own, its = (np.asarray(one.mesh.vertices) - one.centre for one in (mass, other))
     gap = float(away @ beam + (its @ beam).min() - (own @ beam).max())
     aside, size = (np.abs(one @ np.column_stack([array, across])) for one in (away, own))
-    weak = not mass.bright and not other.bright and np.nanmedian(_sampled(power, _core(mass))) > LIMITS.seed
-    return bool(weak and away @ beam > 0 and gap < near_mm and (aside < size.max(axis=0)).all())
+    if mass.bright or other.bright or away @ beam <= 0 or gap >= near_mm or (aside >= size.max(axis=0)).any():
+        return False
+    core = _sampled(power, _core(mass))
+    return bool(np.isfinite(core).any() and np.median(core[np.isfinite(core)]) > LIMITS.seed)
 
 
 def _core(mass: Mass) -> Array:
@@ -183,16 +193,20 @@ def _sampled(power: EchoPower, places: Array) -> Array:
     return np.where(there, power.volume.voxels[k, j, i], np.nan)
 
 
-def _shadow(mass: Mass) -> LeftOut:
-    """Leave out what isn't dark any more."""
-    return _left_out("shadow of a mass", mass, "masses before it shadow it")
+def _shadow(mass: Mass, power: EchoPower) -> LeftOut:
+    """Leave out what isn't dark any more, or isn't seen."""
+    if np.isfinite(_sampled(power, _core(mass))).mean() > LIMITS.least_seen:
+        return _left_out("shadow of a mass", mass, power, "it isn't dark without the shadows of masses before it")
+    return _left_out("in the shadow of a mass", mass, power, "too little sound comes there through masses before it")
 
 
-def _left_out(reason: Reason, mass: Mass, why: str) -> LeftOut:
-    (x, y, z), (along, down, across) = mass.centre.tolist(), mass.mesh.extents.tolist()
-    kind, extents = "bright" if mass.bright else "dark", (along, down, across)
+def _left_out(reason: Reason, mass: Mass, power: EchoPower, why: str) -> LeftOut:
+    """What is told of a mass that is left out."""
+    (x, y, z), kind = mass.centre.tolist(), "bright" if mass.bright else "dark"
+    along, down, across = np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions, axis=0).tolist()
     text = f"a {kind} body of {mass.volume:.0f} mm3 at {x:.0f}, {y:.0f}, {z:.0f} mm is left out: {why}"
-    return LeftOut(reason=reason, volume_mm3=mass.volume, centre_mm=(x, y, z), extents_mm=extents, text=text).say()
+    extents = (along, down, across)
+    return LeftOut(reason=reason, volume_mm3=mass.volume, centre_mm=(x, y, z), extents_mm=extents, text=text)
 
 
 def shown(masses: Sequence[Mass], world_from_pixel: Array, shape: tuple[int, int], sound: Sound) -> Iterator[Mask]:

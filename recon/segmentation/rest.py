@@ -85,6 +85,7 @@ class Rest:
     scale: tuple[float, float]  # mm a pixel
     parted_mm: Array  # (n,) standard deviation of breath against pressure
     contact_mm: float  # standard deviation of the skin's distance in all B-scans
+    kept_mm: Array  # (n,) of pressure and breath that is left as it is: too little, or too much to be believed
     gel_mm: Array  # (n,) that the face seems to stand off, left as it is: gel, or a body that has risen
     period_s: float | None  # of the breath, where one was found
 
@@ -116,7 +117,12 @@ class Rest:
         if self.risen_mm.any():
             every = "" if self.period_s is None else f" every {self.period_s:.1f} s"
             parts.append(f"the body rose by {np.median(self.risen_mm):.2f} mm, 95 % {_most(self.risen_mm):.2f}{every}")
-        return [f"rest        undone: {'; '.join(parts)}"] if parts else []
+        told = [f"rest        undone: {'; '.join(parts)}"] if parts else []
+        if wild := int((self.kept_mm > LIMITS.most_pressed_mm).sum()):
+            told.append(
+                f"warning     rest: in {wild} B-scans the face lies too deep in the skin, or too far off: nothing is undone"
+            )
+        return told
 
     def pressed_at(self, scans: NDArray[np.int64], pixels: Array) -> Array:
         """Displacements : (m, 3) mm in the world, by pressure, of what rests at pixels : (m, 2) u, v of B-scans : (m,)."""
@@ -143,6 +149,7 @@ class Rest:
                 LIMITS.risen * risen,
                 self.parted_mm[scans, None] * parted,
                 self.contact_mm * together,
+                self.kept_mm[scans, None] * self.up,
                 self.gel_mm[scans, None] / np.sqrt(12) * self.up,
             ]
         )
@@ -174,14 +181,17 @@ def find(scans: Scans, skin: trimesh.Trimesh, touching: Contact) -> Rest | None:
     risen, left = risen + off / shares, left - off
     pressed = np.maximum(-left, 0) * np.clip(-left / least_mm - 1, 0, 1)
     wild = (pressed > LIMITS.most_pressed_mm) | (np.abs(risen) > LIMITS.most_risen_mm) | ~placed
+    whole = np.hypot(np.maximum(-left, 0), np.where(wild, risen, 0.0))
     risen, pressed = np.where(wild, 0.0, risen), np.where(wild, 0.0, pressed)
     pressed = pressed if _most(pressed) > least_mm else np.zeros_like(pressed)
+    kept = np.where(placed & (whole - pressed > least_mm), whole - pressed, 0.0)
     raw = np.where(np.isfinite(distances), distances, -np.maximum(depths.max(axis=1), -FAR_MM))
     bases = np.maximum(((origins - level) @ up) / np.maximum(-axes[:, :, 1] @ up, 0.3), LIMITS.least_base_mm)
     fields = _fields(depths + raw[:, None] + pressed[:, None], pressed, bases, patches, scans, scale)
     gel = np.where(seen & (left > least_mm), left, 0.0)
     parted = np.full(len(placed), left.std()) if parts.period_s is None else parts.sigma  # what changes may be a part of a breath
-    return Rest(risen, pressed, up, fields, axes, scans.shape, scale, parted, contact_mm, gel, parts.period_s)
+    period_s = parts.period_s if known else None
+    return Rest(risen, pressed, up, fields, axes, scans.shape, scale, parted, contact_mm, kept, gel, period_s)
 
 
 def undone(scans: Scans, rest: Rest) -> Scans:

@@ -43,10 +43,12 @@ class MassLimits:
     fine_mm: float = 0.6  # the former, of small bodies, whose borders have no lobes
     small_mm3: float = 6.0  # least of what is seen of small bodies; speckle has none
     dense: float = 0.8  # share of a small one's voxels with a pixel in them: between B-scans far apart are pieces of shadows
+    spot_mm3: float = 1.0  # of still smaller ones that are named
     few: int = 3  # small ones, at most, beyond which they are taken for the tissue's own unevenness
     streak: float = 2.5  # height of a body down the beam over its thickness, above which it may be the shadow of a border
     core: float = 0.6  # of a mass's extent: its darkest part
     still: float = 0.5  # of power in its core at most, after the shadows of others are cleared
+    told: int = 8  # of what is left out for one reason, that are said; all are listed
     passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 
@@ -115,6 +117,7 @@ class Found(NamedTuple):
 
     masses: list[Mass]
     left_out: list[LeftOut]
+    uneven_db: float = np.nan  # standard deviation of the tissue's power
 
 
 class Candidate(NamedTuple):
@@ -131,7 +134,7 @@ class Rough(NamedTuple):
 
     masses: list[Mass]
     left_out: list[LeftOut]
-    even: bool  # whether the tissue is even enough for faint ones
+    uneven_db: float  # standard deviation of the tissue's power; from FAINT.even_db on, no faint ones are told from it
     hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones
 
 
@@ -145,17 +148,21 @@ def rough(power: EchoPower) -> Rough:
     gap, left_out = _gaps(power)
     ratio, seen = _over_tissue(power)
     dark = seen & (ratio < LIMITS.dark)
-    even = _unevenness(ratio, seen & ~_widen(dark, FAINT.beside_mm, spacing)) < FAINT.even_db
+    uneven_db = _unevenness(ratio, seen & ~_widen(dark, FAINT.beside_mm, spacing))
+    even = uneven_db < FAINT.even_db
     dark &= ~_risen(np.where(dark, ratio, np.inf))
     seed = FAINT.seed if even else LIMITS.seed
-    bodies, touching = _bodies(_opened(dark, LIMITS.open_mm, spacing), ratio, seen, spacing)
+    bodies, edge = _bodies(_opened(dark, LIMITS.open_mm, spacing), ratio, seen, spacing)
+    touching = _mask(edge, dark.shape)
     large = [one for one in bodies if one.volume >= LIMITS.least_mm3]
     dim = dark | (seen & even & (ratio < FAINT.dark))
     fine, _ = _bodies(_opened(dim, LIMITS.fine_mm, spacing), ratio, seen, spacing, taken=touching | _mask(large, dark.shape))
     small = [one for one in fine if one.volume >= LIMITS.small_mm3 and ratio[one.part][one.inside].min() <= seed]
     if even:
-        spots, _ = _bodies(dim, ratio, seen, spacing, taken=touching | _mask([*large, *small], dark.shape))
-        left_out += [_leave_out("small", one, power) for one in spots if ratio[one.part][one.inside].min() <= seed]
+        labels, _ = ndimage.label(dim)
+        seeded = np.isin(labels, np.unique(labels[dim & (ratio <= seed)]))  # speckle alone is hardly as dark
+        spots, _ = _bodies(dim & seeded, ratio, seen, spacing, taken=touching | _mask([*large, *small], dark.shape))
+        left_out += [_leave_out("small", one, power) for one in spots if one.volume >= LIMITS.spot_mm3]
     chosen = [one for one in large if one.core <= seed]
     left_out += [_leave_out("weak contrast", one, power) for one in large if one.core > seed]
     behind = np.logical_or.accumulate(_widen(_mask(chosen, dark.shape), 2 * LIMITS.grow_mm, spacing), axis=1)
@@ -167,7 +174,7 @@ def rough(power: EchoPower) -> Rough:
             left_out.append(_leave_out("small", one, power))
     cut, shadowed = _cut_bodies(dark, _mask(chosen, dark.shape), ratio, seen, gap, power)
     left_out += cut
-    masses = list[Mass]()
+    masses, kept = list[Mass](), list[Candidate]()
     for one in chosen:
         height, thick = np.ptp(np.nonzero(one.inside)[1]) * spacing[1], _thickness(one.inside, spacing)
         if height > LIMITS.streak * thick:
@@ -177,13 +184,30 @@ def rough(power: EchoPower) -> Rough:
         else:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), ratio[one.part], 1.0)
             masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
-    return Rough(masses, left_out, even, shadowed | (dark & ~_mask(chosen, dark.shape)))
+            kept.append(one)
+    say(left_out)
+    return Rough(masses, left_out, uneven_db, shadowed | (dark & ~_mask(kept, dark.shape)))
 
 
-def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
+def say(left_out: Sequence[LeftOut]) -> None:
+    """Log what is left out: of each reason the largest ones, and how many others."""
+    for reason in dict.fromkeys(one.reason for one in left_out if one.reason != "gap"):
+        alike = sorted((one for one in left_out if one.reason == reason), key=lambda one: -one.volume_mm3)
+        for one in alike[: LIMITS.told]:
+            one.say()
+        if len(alike) > LIMITS.told:
+            log.info("%d more are left out: %s", len(alike) - LIMITS.told, reason)
+
+
+def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[int, ...] = (-1, 1)) -> Found:
     """Bodies little darker than even tissue around, or brighter, in power without the shadows of the masses that are known.
 
+    What is left out isn't logged.
+
+    Parameters
+    ----------
     hidden : voxels where none are looked for, as of `rough`
+    signs : -1 for darker ones, 1 for brighter ones
     """
     spacing, volume = power.volume.spacing[::-1], power.volume
     free = ~hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
@@ -191,7 +215,7 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
     seen = np.isfinite(_smooth(volume.voxels, power.weight, LIMITS.smooth_mm / spacing))
     known = seen & free & np.isfinite(smooth)
     depths = np.where(known, smooth, np.nan).swapaxes(0, 1).reshape(seen.shape[1], -1)
-    usual = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in depths])  # by depth
+    usual = np.array([np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in depths], np.float32)
     level, contrast = np.broadcast_to(usual[:, None], seen.shape), np.zeros(seen.shape, np.float32)
     for around_mm in (*FAINT.around_mm, 0.0):
         told = known & (level > 0)
@@ -201,9 +225,10 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
             level = np.where(np.isfinite(level), level, usual[:, None])
     plain = known & (np.abs(contrast) < FAINT.least_db)
     found, left_out = list[Mass](), list[LeftOut]()
-    for sign in (-1, 1):
-        bodies, _ = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
-        bodies = [one for one in bodies if one.volume >= FAINT.least_mm3 and abs(one.core) >= FAINT.core_db]
+    for sign in signs:
+        bodies, edge = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
+        bodies, edge = ([one for one in several if _counts(one)] for several in (bodies, edge))
+        left_out += [_leave_out("at the scan's edge", one, power) for one in edge]
         for one in bodies:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), -sign * contrast[one.part], 0.0)
             if np.ptp(np.nonzero(one.inside)[1]) * spacing[1] > LIMITS.streak * _thickness(one.inside, spacing):
@@ -215,6 +240,11 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask) -> Found:
             else:
                 found.append(Mass(meshed(field, -abs(one.core) / 2, one.part, volume, outside=0.0), bright=sign > 0))
     return Found(found, left_out)
+
+
+def _counts(one: Candidate) -> bool:
+    """Whether a body is large enough, and differs enough, for a faint one."""
+    return one.volume >= FAINT.least_mm3 and abs(one.core) >= FAINT.core_db
 
 
 def _tissue_behind(one: Candidate, plain: Mask, spacing: Array) -> float:
@@ -231,11 +261,15 @@ def _tissue_behind(one: Candidate, plain: Mask, spacing: Array) -> float:
 
 def _in_line(one: Candidate, other: Candidate) -> bool:
     """Whether the less wide one of two bodies lies mostly before or behind the other: one of them may be the other's shadow."""
-    first, second = (
-        {(int(k), int(i)) for k, i in np.argwhere(b.inside.any(axis=1)) + np.array([b.part[0].start, b.part[2].start])}
-        for b in (one, other)
-    )
-    return len(first & second) > CUT.behind * min(len(first), len(second))
+    box = [slice(max(a.start, b.start), min(a.stop, b.stop)) for a, b in zip(one.part[::2], other.part[::2], strict=True)]
+    if any(s.stop <= s.start for s in box):
+        return False
+    wide = [body.inside.any(axis=1) for body in (one, other)]
+    shared = [
+        columns[tuple(slice(s.start - p.start, s.stop - p.start) for s, p in zip(box, body.part[::2], strict=True))]
+        for columns, body in zip(wide, (one, other), strict=True)
+    ]
+    return bool((shared[0] & shared[1]).sum() > CUT.behind * min(columns.sum() for columns in wide))
 
 
 def _over_tissue(power: EchoPower) -> tuple[NDArray, Mask]:
@@ -258,13 +292,16 @@ def _over_tissue(power: EchoPower) -> tuple[NDArray, Mask]:
 
 def _unevenness(ratio: NDArray, where: Mask) -> float:
     """Standard deviation, dB, of the tissue's power, robust against bodies in it; infinite without tissue."""
-    return 1.4826 * float(np.median(np.abs(10 * np.log10(np.maximum(ratio[where], 1e-6))))) if where.any() else np.inf
+    known = ratio[where & np.isfinite(ratio)]
+    return 1.4826 * float(np.median(np.abs(10 * np.log10(np.maximum(known, 1e-6))))) if len(known) else np.inf
 
 
-def _bodies(mask: Mask, ratio: NDArray, seen: Mask, spacing: Array, taken: Mask | None = None) -> tuple[list[Candidate], Mask]:
-    """Bodies of a mask with all of their border within the scan, and voxels of the others; none that meets what is taken."""
+def _bodies(
+    mask: Mask, ratio: NDArray, seen: Mask, spacing: Array, taken: Mask | None = None
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Bodies of a mask with all of their border within the scan, and the others; none that meets what is taken."""
     labels, count = ndimage.label(mask)
-    touching, candidates = np.zeros(mask.shape, bool), list[Candidate]()
+    touching, candidates = list[Candidate](), list[Candidate]()
     margin, edge = (np.ceil(one / spacing).astype(int) for one in (2 * LIMITS.grow_mm, LIMITS.edge_mm))
     boxes = ndimage.find_objects(labels)
     for number in range(1, count + 1):
@@ -274,11 +311,10 @@ def _bodies(mask: Mask, ratio: NDArray, seen: Mask, spacing: Array, taken: Mask 
         if taken is not None and (taken[part] & inside).any():
             continue
         ends = any(s.start < m or s.stop > n - m for s, m, n in zip(box, edge, mask.shape, strict=True))
-        if ends or (_widen(inside, LIMITS.edge_mm, spacing) & ~seen[part]).any():
-            touching[part] |= inside
-        else:
-            volume = inside.sum() * float(np.prod(spacing))
-            candidates.append(Candidate(part, inside, volume, float(np.median(ratio[part][inside]))))
+        volume = inside.sum() * float(np.prod(spacing))
+        one = Candidate(part, inside, volume, float(np.median(ratio[part][inside])))
+        cut = ends or (_widen(inside, LIMITS.edge_mm, spacing) & ~seen[part]).any()
+        (touching if cut else candidates).append(one)
     return candidates, touching
 
 
@@ -291,7 +327,7 @@ def _mask(bodies: Sequence[Candidate], shape: tuple[int, ...]) -> Mask:
 
 
 def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
-    """Leave out a body for a reason that is told of it."""
+    """What is told of a body that is left out."""
     spacing = power.volume.spacing[::-1]
     thick = _thickness(one.inside, spacing)
     extents, centre = _extents(ndimage.find_objects(one.inside.astype(int))[0], spacing), _middle(one.inside, one.part, power)
@@ -308,9 +344,11 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
             text = f"a body of {place} is left out: its contrast is weak"
         case "behind the tissue":
             text = f"a body of {place} is left out: no tissue is seen behind it, so it may be what the tissue lies on"
+        case "at the scan's edge":
+            text = f"a body of {place} is left out: it reaches the scan's edge; scan on there if it may be a mass"
         case _:
             text = f"a dark body of {place} is left out: it is too small to be measured, or told from a shadow or uneven tissue"
-    return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text).say()
+    return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text)
 
 
 def _middles(dark: Mask, spacing: Array) -> Mask:
@@ -342,7 +380,7 @@ def _gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
         for one, part in enumerate(ndimage.find_objects(labels), start=1):
             inside = labels[part] == one
             if (volume := inside.sum() * float(np.prod(spacing))) >= GAP.least_mm3:
-                wide, centre = float(np.median(width[part][inside])), _middle(inside, part, power)
+                wide, centre = float(np.median(width[part][inside])), _middle(np.ones_like(inside), part, power)
                 text = f"a gap of {wide:.1f} mm {where}, {volume:.0f} mm3 about {_told(centre)} mm, wasn't scanned: "
                 text += "masses in it may be missed"
                 extents = _extents(part, spacing)
@@ -419,7 +457,7 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
             reason = max(sides, key=lambda name: sides[name])
             text = f"a dark body is {reason}, and is left out: {volume:.0f} mm3 of it at {_told(centre)} mm, "
             text += f"{along:.0f} x {height:.0f} x {across:.0f} mm; {CUT_WAYS.get(reason, 'scan on there')}"
-        left_out.append(LeftOut(reason=reason, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text).say())
+        left_out.append(LeftOut(reason=reason, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text))
         if reason == "behind the tissue":
             left_out += _bumps(inside, middle, power)
             continue
@@ -436,12 +474,12 @@ def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
     labels, _ = ndimage.label(columns & (front < np.median(front[columns]) - CUT.bump_mm))
     for number, box in enumerate(ndimage.find_objects(labels), start=1):
         wide = labels == number
+        if wide.sum() * spacing[0] * spacing[2] < CUT.bump_mm**2:
+            continue
         rim = ndimage.binary_dilation(wide, iterations=3) & ~wide
         if (rim & columns).sum() < CUT.rim * rim.sum():  # at the tissue's edge
             continue
         across, along = ((s.stop - s.start) * float(step) for s, step in zip(box, spacing[::2], strict=True))
-        if wide.sum() * spacing[0] * spacing[2] < CUT.bump_mm**2:
-            continue
         k, i = np.nonzero(wide)
         row = (float(front[k, i].min()) + min(across, along) / 2) / spacing[1]
         places = np.array([i.mean() + part[2].start, row + part[1].start, k.mean() + part[0].start])
@@ -451,7 +489,7 @@ def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
         text += "its shadow reaches the dark behind the tissue, so its back isn't seen"
         extents, volume = (along, deep, across), float(behind[k, :, i].sum() * np.prod(spacing))
         why: Reason = "its shadow hides its back"
-        found.append(LeftOut(reason=why, volume_mm3=volume, centre_mm=(x, y, z), extents_mm=extents, text=text).say())
+        found.append(LeftOut(reason=why, volume_mm3=volume, centre_mm=(x, y, z), extents_mm=extents, text=text))
     return found
 
 

@@ -14,7 +14,7 @@ from recon.freehand import scans as freehand_scans
 from recon.freehand.scans import Scans
 from recon.geometry.primitives import Cylinder
 from recon.model.probe import SCANNER_SPEED
-from recon.segmentation import contact, mass_uncertainty, masses, rest, scan_overlays, tube_cover, tube_wall
+from recon.segmentation import contact, mass_uncertainty, masses, rest, rough_bodies, scan_overlays, tube_cover, tube_wall
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.left_out import LeftOut
@@ -70,10 +70,16 @@ def find_masses(
         scans = freehand_scans.in_memory(rest.undone(scans, moved))
     sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
-    found, left_out = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
+    found, left_out, uneven_db = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found), "left_out": len(left_out)}
-    none_found = "none: no body darker than the tissue on all sides of it; one at the images' side needs strokes beside"
-    lines = [f"tissue      grey {grey:.0f} of 255", *([] if found else [f"masses      {none_found}"])]
+    none_found = "none: no body that differs from the tissue on all sides of it; one at the images' side needs strokes beside"
+    if np.isfinite(uneven_db):
+        figures["tissue_uneven_db"] = uneven_db
+    sought = "" if uneven_db < rough_bodies.FAINT.even_db else ": too uneven for bright or faint masses, none were looked for"
+    lines = [
+        f"tissue      grey {grey:.0f} of 255, uneven by {uneven_db:.1f} dB{sought}",
+        *([] if found else [f"masses      {none_found}"]),
+    ]
     lines += [f"blur        {blur}"] if blur is not None and found else []
     for one in (touching, moved):
         figures |= {} if one is None else one.figures
@@ -114,6 +120,8 @@ def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:
     away, volume, deep = (f" ± {value:{how}}" if np.isfinite(value) else "" for value, how in known)
     extent = " x ".join(f"{value:.1f}" for value in mass.mesh.extents)
     text = f"{mass.volume:.0f}{volume} mm3, centre {centre}{away} mm, {extent} mm"
+    text += ", brighter than the tissue" if mass.bright else ""
+    text += ", touches another: perhaps they are one" if mass.beside else ""
     if under is None:
         return text
     if under.inside is None:

@@ -88,24 +88,28 @@ def _losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, 
     return _fitted_losses(total, count)
 
 
-def passed(recording: Recording, grid: Grid, mass: Mass, sound: Sound) -> float:
-    """Mean power of tissue close behind a mass in the B-scans that it shadows, over that beside it; NaN if none is seen there."""
-    inside, scale, table = distances([mass], grid), pixel_mm(recording.world_from_pixel), recording.table
+def passed(recording: Recording, grid: Grid, masses: Sequence[Mass], number: int, sound: Sound) -> float:
+    """Mean power of tissue close behind one of the masses, in the B-scans that it shadows, over that beside it.
+
+    Tissue near other masses doesn't count; infinite if none is seen behind or beside it.
+    """
+    inside, others = distances([masses[number]], grid), distances([*masses[:number], *masses[number + 1 :]], grid)
+    scale, table = pixel_mm(recording.world_from_pixel), recording.table
     thinned, near_mm, least_mm = 4, (1.5, 4.5), 3.0  # pixels of which one counts; from the border; of the way through the mass
     rows = slice(recording.clip.v, None, thinned)
 
     def near(scan: tuple[NDArray[np.uint8], Array]) -> Array:
         image, matrix = scan
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
-        away = _sample(inside, matrix, lines.u[rows], lines.v[rows])
-        power, around = table[image[rows, ::thinned]], (away > near_mm[0]) & (away < near_mm[1])
+        away, apart = (_sample(field, matrix, lines.u[rows], lines.v[rows]) for field in (inside, others))
+        power, around = table[image[rows, ::thinned]], (away > near_mm[0]) & (away < near_mm[1]) & (apart > near_mm[0])
         behind, beside = around & (lines.within[rows] > least_mm), around & (lines.within[rows] == 0)
         return np.stack([field.sum(axis=1) for field in (power * behind, behind, power * beside, beside)])
 
     scans = zip(recording.images(), recording.world_from_pixel, strict=True)
     sums = sum(threads.mapped(near, (scan for scan in scans if np.isfinite(scan[1]).all())), np.zeros(1))
-    behind, count, beside, others = sums[:, (sums[1] > 0) & (sums[3] > 0)]  # rows with both
-    return float(behind.sum() / (count * beside / others).sum()) if len(count) else np.nan
+    behind, count, beside, free = sums[:, (sums[1] > 0) & (sums[2] > 0)]  # rows with both
+    return float(behind.sum() / (count * beside / free).sum()) if len(count) else np.inf
 
 
 def _fitted_losses(total: Array, count: Array) -> tuple[float, float]:

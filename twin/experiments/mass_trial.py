@@ -20,7 +20,7 @@ from recon.geometry import rigid
 from recon.geometry.surface_tree import signed_distances
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES
-from recon.segmentation.left_out import LeftOut
+from recon.segmentation.left_out import UNLIKELY, LeftOut
 from recon.session import masses_step
 from scenes.acoustics import TISSUES
 from scenes.scene_types import Thing
@@ -83,7 +83,8 @@ def measure(settings: Settings, seed: int) -> Metrics:
     shown = [thing for thing in hidden if seen(planned, inner_points(thing.mesh), kept).any()]
     sigmas = [found.figures[f"{name}_centre_sigma_mm"] for name in found.meshes]
     doubted = any(line.startswith("warning") for line in found.lines)
-    said = Findings(list(found.meshes.values()), sigmas, found.left_out, doubted, axes(scans))
+    told = [one for one in found.left_out if one.reason not in UNLIKELY]
+    said = Findings(list(found.meshes.values()), sigmas, told, doubted, axes(scans))
     return judge(shown, said) | {"contact_mm": found.figures.get("contact_mm", np.nan)}
 
 

@@ -55,3 +55,10 @@ def test_outliers_and_gaps_count_for_nothing(rng):
     harmed[130:140] = np.nan
     whole, parted = (breath.part(TIMES, values, STEADY) for values in (distances, harmed))
     assert parted.period_s == pytest.approx(4.0, rel=0.1) and np.abs(parted.breath - whole.breath).max() < 0.5
+
+
+def test_distances_that_jump_hold_no_breath():
+    """Eight that have nothing to do with each other."""
+    distances = np.array([0.09, 3.30, 1.59, 9.87, 2.06, 8.35, 9.58, 5.54])
+    parts = breath.part(0.05 * np.arange(8), distances, np.ones(8))
+    assert parts.period_s is None and not parts.breath.any()

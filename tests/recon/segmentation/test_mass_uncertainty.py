@@ -82,7 +82,7 @@ def test_what_was_undone_is_uncertain_by_its_shares(rig):
     axes = scans.world_from_pixel[:, :3, :3] / np.linalg.norm(scans.world_from_pixel[:, :3, :3], axis=1, keepdims=True)
     risen, pressed, nothing = np.full(count, 2.0), np.full(count, 2.5), np.zeros(count)
     scale = float(SCALE[0]), float(SCALE[1])
-    moved = Rest(risen, pressed, -axes[0, :, 1], fields, axes, SIZE[::-1], scale, nothing, 0.0, nothing, None)
+    moved = Rest(risen, pressed, -axes[0, :, 1], fields, axes, SIZE[::-1], scale, nothing, 0.0, nothing, nothing, None)
     weights, shown = mass_uncertainty.weights_of(mass), mass_uncertainty.shown_by(np.asarray(mass.mesh.vertices), scans)
     found = mass_uncertainty.by_rest(weights, shown, moved)
     along = np.hypot(1.2 * LIMITS.law, 2.0 * LIMITS.risen)

@@ -87,10 +87,10 @@ def test_a_beam_without_width_leaves_shadows_sharp(recording, planes, spread_mm)
 def test_what_comes_through_a_mass_is_measured_behind_it(recording, planes):
     """Half of the power through its middle; nothing through one that absorbs fifty times as much."""
     grid = echo_power.beam_grid(planes, SHAPE, SPACING_MM)
-    share = shadow_clearing.passed(recording, grid, ball(RADIUS), SOUND)
+    share = shadow_clearing.passed(recording, grid, [ball(RADIUS)], 0, SOUND)
     assert share == pytest.approx(np.exp(-BY_PATH * 6.3), abs=0.08)  # mean way of lines that pass 3 mm and more of it
     images = [image.copy() for image in recording.images()]
     row = round((CENTRE[1] + RADIUS) / PIXEL_MM)
     for image in images:
         image[row:, round((CENTRE[0] - RADIUS) / PIXEL_MM) : round((CENTRE[0] + RADIUS) / PIXEL_MM)] = 0
-    assert shadow_clearing.passed(replace(recording, images=lambda: iter(images)), grid, ball(RADIUS), SOUND) < 0.1
+    assert shadow_clearing.passed(replace(recording, images=lambda: iter(images)), grid, [ball(RADIUS)], 0, SOUND) < 0.1
