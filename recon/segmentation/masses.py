@@ -94,8 +94,9 @@ def from_scans(
         masses += refined(more.masses, power, sum(REFINEMENTS))
     kept = list[Mass]()
     for number, mass in enumerate(masses):
-        if passed(recording, grid, masses, number, sound) < LIMITS.passed:
-            left_out.append(_left_out("its shadow hides its back", mass, power, "all behind it is dark, so its back isn't seen"))
+        least = FAINT.passed if mass.bright else LIMITS.passed
+        if passed(recording, grid, masses, number, sound) < least:
+            left_out.append(_left_out("its shadow hides its back", mass, power, "it is dark behind it, so its back isn't seen"))
         elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
         elif even and not _stands_out(mass, power):

@@ -65,7 +65,7 @@ class CutBodyLimits:
     before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
     around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
     bump_mm: float = 6.0  # by which the dark behind the tissue begins before its median, over as wide a place: a body's shadow
-    rim: float = 0.6  # share of that place's rim with dark behind it: at the tissue's edge it begins early
+    rim: float = 0.5  # share of that place's rim with dark behind it: at the tissue's edge it begins early
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
@@ -99,6 +99,7 @@ class FaintLimits:
     core_db: float = 2.8  # of contrast in its middle
     beside_mm: float = 2.0  # of masses, where shadows and borders are left over
     least_mm3: float = 80.0
+    passed: float = 0.3  # of power that comes through a bright one, at least: it fades towards its back by as much
     behind: float = 0.5  # share of tissue in what lies behind it: else it may be what the tissue lies on
     behind_mm: float = 5.0  # of that
 
