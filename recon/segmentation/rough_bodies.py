@@ -64,6 +64,7 @@ class CutBodyLimits:
     mostly: float = 0.6  # share of what was seen before it that shows tissue: elsewhere the probe doesn't touch
     before: float = 0.2  # share of what lies before it that was seen; gel beside the skin begins at the face
     around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
+    thick: float = 0.3  # of its lesser width, that of such a one: gel on a curved skin is thinner
     bump_mm: float = 6.0  # by which the dark behind the tissue begins before its median, over as wide a place: a body's shadow
     rim: float = 0.5  # share of that place's rim with dark behind it: at the tissue's edge it begins early
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
@@ -442,6 +443,7 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         }
         covered, told = front.sum() > CUT.before * before.sum(), (beside & here).sum()
         among = told > CUT.mostly * beside.sum() and (beside & bright[part]).sum() > CUT.around * told  # tissue
+        among = among and _thickness(inside, spacing) > CUT.thick * min(along, across)
         if not covered and among:
             sides = {"cut by the ringing at the face": 1}
         covered = among if not covered else (front & bright[part]).sum() >= CUT.mostly * front.sum()
