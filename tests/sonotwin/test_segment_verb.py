@@ -79,7 +79,7 @@ def test_the_interface_gives_the_verbs_mass(capture, segmented):
     sweep = sonotwin.read_sweep(capture)
     scans, target_from_pixel = list(sweep.images()), sweep.probe.target_from_image @ np.diag([*sweep.probe.scale, 1, 1])
     placed = sweep.poses(LAG_S) @ target_from_pixel  # in the verb's order: rounding decides on pixels at voxels' borders
-    (mass,) = sonotwin.find_masses(lambda: iter(scans), SIZE[::-1], placed, sonotwin.Sound(), blur=sonotwin.Blur())
+    (mass,) = sonotwin.find_masses(lambda: iter(scans), SIZE[::-1], placed, sonotwin.Sound(), blur=sonotwin.Blur()).masses
     figures = json.loads((segmented / "metrics.json").read_text())
     assert mass.volume == pytest.approx(figures["mass0_volume_mm3"], rel=1e-6)
     assert np.allclose(mass.centre, [figures[f"mass0_centre_{axis}_mm"] for axis in "xyz"], atol=1e-6)
