@@ -76,21 +76,21 @@ def from_scans(
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
-    first = rough(power)
-    even = first.uneven_db < FAINT.even_db
-    bright = faint(power, [], first.hidden, signs=(1,)).masses if even else []
-    masses, left_out = refined([*first.masses, *bright], power, roughly), list[LeftOut]()
+    begun = rough(power)
+    even = begun.uneven_db < FAINT.even_db
+    bright = faint(power, [], begun.hidden, signs=(1,)).masses if even else []
+    masses, left_out = refined([*begun.masses, *bright], power, roughly), list[LeftOut]()
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            left_out += [_shadow(mass, power) for mass in masses if _is_shadow(mass, power)]
-            masses = refined([mass for mass in masses if not _is_shadow(mass, power)], power, times)
-    more = faint(power, masses, first.hidden) if even else Found([], [])
+            masses, shadows = _without_shadows(masses, power)
+            masses, left_out = refined(masses, power, times), left_out + shadows
+    more = faint(power, masses, begun.hidden) if even else Found([], [])
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
-        left_out += [_shadow(mass, power) for mass in masses if _is_shadow(mass, power)]
-        masses = [mass for mass in masses if not _is_shadow(mass, power)]
+        masses, shadows = _without_shadows(masses, power)
+        left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
     kept = list[Mass]()
     for number, mass in enumerate(masses):
@@ -109,7 +109,7 @@ def from_scans(
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     masses = [part for mass in masses for part in parted(mass, power.volume.directions)]
     say(left_out)
-    return Found(sorted(masses, key=lambda mass: -mass.volume), first.left_out + left_out, first.uneven_db)
+    return Found(sorted(masses, key=lambda mass: -mass.volume), begun.left_out + left_out, begun.uneven_db)
 
 
 def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:
@@ -143,11 +143,23 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     return grey
 
 
-def _is_shadow(mass: Mass, power: EchoPower) -> bool:
-    """Whether a dark body isn't dark any more after the shadows of others have been taken away."""
-    values = _sampled(power, _core(mass))
-    seen = np.isfinite(values)
-    return not mass.bright and not (seen.mean() > LIMITS.least_seen and np.median(values[seen]) < LIMITS.still)
+def _without_shadows(masses: Sequence[Mass], power: EchoPower) -> tuple[list[Mass], list[LeftOut]]:
+    """Masses but for dark ones that aren't dark any more, or aren't seen, in power without the shadows of others; and these."""
+    kept, left_out = list[Mass](), list[LeftOut]()
+    for mass in masses:
+        values = _sampled(power, _core(mass))
+        seen = np.isfinite(values)
+        if mass.bright:
+            kept.append(mass)
+        elif seen.mean() <= LIMITS.least_seen:
+            why = "too little sound comes there through masses before it"
+            left_out.append(_left_out("in the shadow of a mass", mass, power, why))
+        elif np.median(values[seen]) >= LIMITS.still:
+            why = "it isn't dark without the shadows of masses before it"
+            left_out.append(_left_out("shadow of a mass", mass, power, why))
+        else:
+            kept.append(mass)
+    return kept, left_out
 
 
 def _stands_out(mass: Mass, power: EchoPower) -> bool:
@@ -192,13 +204,6 @@ def _sampled(power: EchoPower, places: Array) -> Array:
     i, j, k = np.clip(voxel, 0, size - 1).T
     there = (power.weight[k, j, i] > 0) & ((voxel >= 0) & (voxel < size)).all(axis=1)
     return np.where(there, power.volume.voxels[k, j, i], np.nan)
-
-
-def _shadow(mass: Mass, power: EchoPower) -> LeftOut:
-    """Leave out what isn't dark any more, or isn't seen."""
-    if np.isfinite(_sampled(power, _core(mass))).mean() > LIMITS.least_seen:
-        return _left_out("shadow of a mass", mass, power, "it isn't dark without the shadows of masses before it")
-    return _left_out("in the shadow of a mass", mass, power, "too little sound comes there through masses before it")
 
 
 def _left_out(reason: Reason, mass: Mass, power: EchoPower, why: str) -> LeftOut:

@@ -50,9 +50,7 @@ class Foot:
 class RestLimits:
     """What is undone, and what of it stays unknown."""
 
-    least_mm: float = (
-        0.3  # within the skin, or off it with a breath: nothing is undone, for noise and a little gel; all from twice
-    )
+    least_mm: float = 0.3  # within the skin, or off it with a breath: nothing is undone, for noise and gel; all from twice
     least_sigma: float = 3.0  # standard deviations of the contact, if that is more
     gel_mm: float = 1.0  # above tissue that the B-scan shows at once, as `contact.LIMITS` allows
     risen_mm: float = 2.0  # off a skin that some B-scans show at once, from where the body has risen, in others by less

@@ -1,4 +1,4 @@
-"""Dark bodies in averaged echo power, roughly, and what is left out with its reason: cut by the scan, or hardly a mass."""
+"""Dark and bright bodies in averaged echo power, roughly, and what is left out with its reason."""
 
 import logging
 from collections.abc import Sequence
@@ -178,8 +178,7 @@ def rough(power: EchoPower) -> Rough:
     left_out += cut
     masses, kept = list[Mass](), list[Candidate]()
     for one in chosen:
-        height, thick = np.ptp(np.nonzero(one.inside)[1]) * spacing[1], _thickness(one.inside, spacing)
-        if height > LIMITS.streak * thick:
+        if _is_streak(one, spacing):
             left_out.append(_leave_out("streak down the beam", one, power))
         elif shadowed[one.part][one.inside].mean() > CUT.behind:
             left_out.append(_leave_out("behind a cut body", one, power))
@@ -233,7 +232,7 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[i
         left_out += [_leave_out("at the scan's edge", one, power) for one in edge]
         for one in bodies:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), -sign * contrast[one.part], 0.0)
-            if np.ptp(np.nonzero(one.inside)[1]) * spacing[1] > LIMITS.streak * _thickness(one.inside, spacing):
+            if _is_streak(one, spacing):
                 left_out.append(_leave_out("streak down the beam", one, power))
             elif any(_in_line(one, other) for other in bodies if other is not one):
                 left_out.append(_leave_out("weak contrast", one, power))
@@ -247,6 +246,11 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[i
 def _counts(one: Candidate) -> bool:
     """Whether a body is large enough, and differs enough, for a faint one."""
     return one.volume >= FAINT.least_mm3 and abs(one.core) >= FAINT.core_db
+
+
+def _is_streak(one: Candidate, spacing: Array) -> bool:
+    """Whether a body is so much longer down the beam than thick that it may be the shadow of a border."""
+    return bool(np.ptp(np.nonzero(one.inside)[1]) * spacing[1] > LIMITS.streak * _thickness(one.inside, spacing))
 
 
 def _tissue_behind(one: Candidate, plain: Mask, spacing: Array) -> float:
