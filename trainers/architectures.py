@@ -1,22 +1,23 @@
-"""The networks of the tracker: those as published, with the published names of their weights, and smaller, faster ones of ours.
+"""The networks of the tracker, as published with the published names of their weights, and smaller ones of ours; one for masses.
 
 A detector takes grey/255 (n, 1, h, w), h and w multiples of 8, and gives logits of where a circle's centre is, (n, 65, h/8, w/8):
 pixel 8 row + column of a cell, or 64 for none; and of which circle it is, (n, circles + 1, h/8, w/8): c0, c1 and on, or none. A
 segmenter takes patches (n, 1, h, w), h and w multiples of 8, and gives logits (n, 1, h, w) of the filled outer disc at the middle
-of each.
+of each. `masses` takes B-scans (n, 1, h, w), h and w multiples of 16, and gives logits (n, 1, h, w) of a mass at each pixel.
 
 Source of the published ones: Meza et al. 2021, MarkerPose; the detector's layout is that of DeTone et al. 2018, SuperPoint.
 """
 
 import math
 from collections import OrderedDict
+from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d
 
-Name = Literal["detector", "segmenter", "published_detector", "published_segmenter"]
+Name = Literal["detector", "segmenter", "published_detector", "published_segmenter", "masses"]
 
 PIXELS, NO_PIXEL = 65, 64  # classes of a cell: its 64 pixels, and none
 CELL = 8  # px, edge of a cell
@@ -26,7 +27,7 @@ CELLS_A_CIRCLE = 200  # about, in what a detector trains with
 def network(name: Name, circles: int) -> nn.Module:
     """A network with fresh weights, from torch's global generator, for a target of some circles."""
     if not is_detector(name):
-        return {"segmenter": Segmenter, "published_segmenter": PublishedSegmenter}[name]()
+        return {"segmenter": Segmenter, "published_segmenter": PublishedSegmenter, "masses": MassSegmenter}[name]()
     module = {"detector": Detector, "published_detector": PublishedDetector}[name](circles=circles)
     begin_with_nothing(module.get_parameter("convD.3.bias" if name.startswith("published") else "detection.3.bias"))
     return module
@@ -160,6 +161,27 @@ class Segmenter(nn.Module):
         quarter = self.up2(torch.cat([_doubled(eighth), quarter], 1))
         half = self.up1(torch.cat([_doubled(quarter), half], 1))
         return interpolate(self.out(half), scale_factor=2, mode="bilinear", align_corners=False)
+
+
+class MassSegmenter(nn.Module):
+    """Ours: a U-Net of five levels; what lies around and behind tells masses from lobules, so the last sees a whole B-scan."""
+
+    def __init__(self, channels: tuple[int, ...] = (12, 24, 48, 96, 96)) -> None:
+        super().__init__()
+        self.down = nn.ModuleList(DoubleConv(*pair) for pair in pairwise((1, *channels)))
+        wider = channels[::-1]
+        self.up = nn.ModuleList(DoubleConv(low + high, high) for low, high in pairwise(wider))
+        self.out = nn.Conv2d(channels[0], 1, 1)
+
+    def forward(self, scan: Tensor) -> Tensor:
+        """(n, 1, h, w) to logits of the same shape."""
+        levels = [self.down[0](scan)]
+        for stage in self.down[1:]:
+            levels.append(stage(max_pool2d(levels[-1], 2)))
+        features = levels.pop()
+        for stage in self.up:
+            features = stage(torch.cat([_doubled(features), levels.pop()], 1))
+        return self.out(features)
 
 
 def weights_of(module: nn.Module) -> "OrderedDict[str, Tensor]":

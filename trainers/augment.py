@@ -1,7 +1,7 @@
 """Augmentation of whole batches in torch: poses, light, lenses, noise, compression.
 
-Images are (n, 1, h, w) float32 in digital numbers, 0 to 255, and every random number comes from the generator passed in. Nothing
-is ever mirrored: no target has its circles in the other order.
+Images are (n, 1, h, w) float32 in digital numbers, 0 to 255, and every random number comes from the generator passed in. Views
+and patches are never mirrored: no target has its circles in the other order. B-scans are.
 """
 
 import math
@@ -40,6 +40,43 @@ def turns(n: int, scales: tuple[float, float], generator: Generator) -> Tensor:
     stretch = torch.diag_embed(torch.stack([narrow, torch.ones(n)], -1))
     across = _rotation(direction)
     return scale[:, None, None] * _rotation(angle) @ across @ stretch @ across.mT
+
+
+def tilts(n: int, generator: Generator) -> Tensor:
+    """Linear maps (n, 2, 2) of B-scans: half of them mirrored, tilted by up to 8 degrees, scaled, wider or narrower."""
+    angle, scale = uniform(-0.14, 0.14, n, generator), log_uniform(0.6, 1.5, n, generator)
+    wide = log_uniform(0.8, 1.25, n, generator)
+    side = torch.where(torch.rand(n, generator=generator) < 0.5, -1.0, 1.0)
+    return scale[:, None, None] * _rotation(angle) @ torch.diag_embed(torch.stack([side * wide, torch.ones(n)], -1))
+
+
+def scanned(images: Tensor, generator: Generator) -> Tensor:
+    """B-scans (n, 1, h, w) of digital numbers as of another scanner: greys, gain over depth, contact, grain, sharpness."""
+    n, _, height, width = images.shape
+
+    def column(values: Tensor) -> Tensor:
+        return values[:, None, None, None]
+
+    grey = (images / WHITE).clamp(min=0) ** column(log_uniform(0.55, 1.7, n, generator))
+    grey = grey * column(log_uniform(0.6, 1.9, n, generator)) + column(uniform(-0.06, 0.06, n, generator)) * (grey > 0)
+    depth, across = torch.linspace(-1, 1, height)[:, None], torch.linspace(-1, 1, width)
+    grey = grey * (1 + column(uniform(-0.4, 0.4, n, generator)) * depth)
+    contact = uniform(-1.0, 1.0, n, generator)  # somewhere along the array
+    lost = column(uniform(0.0, 0.7, n, generator) * (torch.rand(n, generator=generator) < 0.2))
+    grey = grey * (1 - lost * torch.exp(-0.5 * ((across - column(contact)) / column(uniform(0.03, 0.15, n, generator))) ** 2))
+    images = WHITE * grey * (1 + column(uniform(0.0, 0.25, n, generator)) * torch.randn(images.shape, generator=generator))
+    images = _some(0.5, images, generator, _grained)
+    images = _some(0.3, images, generator, _blurred)
+    images = _some(0.25, images, generator, partial(_thumbnail, 0.45))
+    return images.clamp(0, WHITE).round()
+
+
+def _grained(images: Tensor, generator: Generator) -> Tensor:
+    """With further speckle, of grains of up to some pixels."""
+    noise = torch.randn(images.shape, generator=generator)
+    coarse = _blurred(noise, generator)
+    coarse = coarse / coarse.std((2, 3), keepdim=True).clamp(min=1e-6)
+    return images * (1 + uniform(0.05, 0.4, len(images), generator)[:, None, None, None] * coarse).clamp(min=0)
 
 
 def warp(images: Grey, linear: Tensor, source: Tensor, goal: Tensor, size: tuple[int, int], fill: Tensor) -> Tensor:

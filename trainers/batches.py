@@ -12,8 +12,9 @@ from torch import Generator, Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from recon.errors import InputError
-from trainers.augment import WHITE, moved, occlude, photograph, turns, uniform, warp
+from trainers.augment import WHITE, moved, occlude, photograph, scanned, tilts, turns, uniform, warp
 from trainers.labels import Labels, label_offset, labels, seen_in_view
+from trainers.scan_reader import Scans
 from trainers.shard_reader import PATCH, Data, Patches, Views
 from trainers.shard_truth import HIDDEN, SEEN
 
@@ -21,6 +22,8 @@ TARGET_IN_CROP = 0.85  # of crops from views with a target are about it; the oth
 COVERED = (HIDDEN + SEEN) / 2  # visible fraction of a circle whose centre something was put before: neither answer is wrong
 SCALES, DISC_SCALES = (0.5, 1.6), (0.6, 1.5)  # least and most, of views and of patches
 COARSEST, COARSEST_DISC = 0.45, 0.22  # a picture 300 px wide may have been made larger, to full resolution
+SCAN = (112, 128)  # px, width and height of a B-scan that is trained with
+SHOWS_MASS = 0.6  # of B-scans, chosen among those with a mass; the others of all
 SHIFT = 12.0  # px, most, of a disc from the middle of its patch: the detector's error, and the rounding
 
 Batch = tuple[Tensor, Tensor, Tensor]
@@ -37,11 +40,11 @@ class Crops:
 
 @dataclass(frozen=True)
 class Discs:
-    """A batch for a segmenter."""
+    """A batch for a segmenter: of patches, h = w = 120, or of B-scans."""
 
-    images: Tensor  # (n, 1, 120, 120) grey/255
-    masks: Tensor  # (n, 1, 120, 120) from 0 to 1
-    weights: Tensor  # (n, 1, 120, 120) 0 where the patch shows nothing
+    images: Tensor  # (n, 1, h, w) grey/255
+    masks: Tensor  # (n, 1, h, w) from 0 to 1
+    weights: Tensor  # (n, 1, h, w) 0 where the image shows nothing
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,9 @@ class Batches(Dataset[Batch]):
         generator = generator_of(self.seed, index)
         if isinstance(self.data, Patches):
             some = discs(self.data, self.size, generator)
+            return some.images, some.masks, some.weights
+        if isinstance(self.data, Scans):
+            some = scans(self.data, self.size, generator)
             return some.images, some.masks, some.weights
         some = crops(self.data, self.size, self.crop_px, generator, self.scales)
         return some.images, some.labels.pixel, some.labels.identity
@@ -157,6 +163,24 @@ def discs(patches: Patches, size: int, generator: Generator) -> Discs:
     guessed = torch.isfinite(drawn[:, 0]) & (torch.from_numpy(patches.visible[which]) < SEEN)  # no detector leads there
     known = known * ~guessed[:, None, None, None]
     return Discs(photograph(images, white, COARSEST_DISC, generator) / WHITE, masks, known)
+
+
+def scans(data: Scans, size: int, generator: Generator) -> Discs:
+    """`size` random B-scans with their masses, mirrored, tilted, scaled and of another scanner."""
+    shows = np.flatnonzero(data.masks.max((1, 2)) > 0)
+    which = torch.randint(len(data), (size,), generator=generator).numpy()
+    if len(shows):
+        some = torch.randint(len(shows), (size,), generator=generator).numpy()
+        which = np.where((torch.rand(size, generator=generator) < SHOWS_MASS).numpy(), shows[some], which)
+    images, masks = data.images[which], data.masks[which]
+    width = images.shape[2]
+    linear = tilts(size, generator)
+    source = torch.tensor([(width - 1) / 2, 0.0]) + torch.zeros(size, 2)
+    goal = torch.tensor([(SCAN[0] - 1) / 2, 0.0]) + uniform(-1.0, 1.0, (size, 2), generator) * torch.tensor([12.0, 8.0])
+    change = (linear, source, goal, SCAN)
+    known = (warp(np.full_like(images, 255), *change, torch.zeros(size)) > 254).float()
+    masks = warp(masks, *change, torch.zeros(size)) / 255
+    return Discs(scanned(warp(images, *change, torch.zeros(size)), generator) / WHITE, masks, known)
 
 
 def _fill(images: NDArray[np.uint8], generator: Generator) -> Tensor:

@@ -20,7 +20,8 @@ from recon.errors import InputError, brief, reason
 from recon.files import atomic
 from recon.tracking.networks import TRAINED_FOR, WEIGHTS
 from trainers import architectures
-from trainers.architectures import Name, is_detector, weights_of
+from trainers.architectures import Name, weights_of
+from trainers.batches import SCAN
 from trainers.shard_reader import PATCH, VIEW
 
 SHIPPED = Path("shipped")  # in the place of folders: the published networks that come with sonotwin
@@ -30,6 +31,11 @@ DAMAGE = (  # what reading damaged files of weights ends in
     *(OSError, MemoryError, NameError, struct.error, zipfile.BadZipFile),
 )
 MOST_BYTES = 1 << 29  # of a checkpoint's parts, once they are unpacked
+INTERFACES = {  # names of input and outputs, and a size
+    "detector": ("image", ("detection", "identity"), VIEW),
+    "segmenter": ("patch", ("mask",), (PATCH, PATCH)),
+    "masses": ("scan", ("mask",), SCAN),
+}
 AGREEMENT = 1e-4  # of the largest logit, most between torch and ONNX Runtime
 
 
@@ -171,8 +177,8 @@ def _read(path: Path) -> dict[Any, Any]:
         raise InputError(f"{path}: expected weights as safetensors, found a damaged file: {reason(error)}") from None
 
 
-def save_onnx(path: Path, network: nn.Module, name: Name, kind: str) -> None:
-    """Write ONNX with free batch, height and width, for a kind of target, and make sure of ONNX Runtime's answers.
+def save_onnx(path: Path, network: nn.Module, name: Name, kind: str = "") -> None:
+    """Write ONNX with free batch, height and width, for a kind of target if any, and make sure of its answers.
 
     Raises
     ------
@@ -180,9 +186,8 @@ def save_onnx(path: Path, network: nn.Module, name: Name, kind: str) -> None:
         If it doesn't.
     """
     network = network.eval().to("cpu").float()
-    given, answers = ("image", ("detection", "identity")) if is_detector(name) else ("patch", ("mask",))
+    given, answers, (width, height) = INTERFACES[name.removeprefix("published_")]
     axes = {given: {0: "n", 2: "h", 3: "w"}} | {answer: {0: "n", 2: f"h_{answer}", 3: f"w_{answer}"} for answer in answers}
-    width, height = VIEW if is_detector(name) else (PATCH, PATCH)
     example = torch.rand(2, 1, height, width, generator=torch.Generator().manual_seed(0))
     with atomic.new_file(path) as temporary:
         with warnings.catch_warnings():
@@ -199,9 +204,9 @@ def save_onnx(path: Path, network: nn.Module, name: Name, kind: str) -> None:
                 dynamo=False,
             )
         with temporary.open("ab") as file:
-            file.write(_metadata(TRAINED_FOR, kind))
+            file.write(_metadata(TRAINED_FOR, kind) if kind else b"")
         _check(temporary, network, example)
-        _check(temporary, network, example[:1, :, : height // 2 // 8 * 8, : width // 2 // 8 * 8])
+        _check(temporary, network, example[:1, :, : height // 2 // 16 * 16, : width // 2 // 16 * 16])
 
 
 def _metadata(key: str, value: str) -> bytes:

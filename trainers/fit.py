@@ -24,8 +24,9 @@ from trainers.architectures import Name, is_detector
 from trainers.batches import SCALES, Batches
 from trainers.checkpoints import TRAIN
 from trainers.labels import Labels, detector_loss, segmenter_loss
-from trainers.network_metrics import measure_detector, measure_segmenter
-from trainers.shard_reader import Data, Views, chosen
+from trainers.network_metrics import measure_detector, measure_masses, measure_segmenter
+from trainers.scan_reader import Scans
+from trainers.shard_reader import Data, Patches, Views, chosen
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.jsonl"
 WARM_UP = 0.05  # of the training, over which the learning rate rises
@@ -148,7 +149,13 @@ def fit(start: nn.Module, train: Data, validation: Data, plan: Plan, folder: Pat
 def measure(module: nn.Module, data: Data) -> dict[str, float | int]:
     """Figures of a network, as of `trainers.network_metrics`, in 32 bits."""
     looked_at = deepcopy(module).cpu().float()
-    return measure_detector(looked_at, data) if isinstance(data, Views) else measure_segmenter(looked_at, data)
+    match data:
+        case Views():
+            return measure_detector(looked_at, data)
+        case Patches():
+            return measure_segmenter(looked_at, data)
+        case Scans():
+            return measure_masses(looked_at, data)
 
 
 def progress(plan: Plan, step: int, seconds: float) -> float:

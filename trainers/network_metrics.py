@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, pixel_shuffle
 
 from trainers.architectures import NO_PIXEL
+from trainers.scan_reader import Scans
 from trainers.shard_reader import Patches, Views
 from trainers.shard_truth import HIDDEN, SEEN, UNNAMED
 
@@ -146,6 +147,29 @@ def measure_segmenter(network: nn.Module, patches: Patches) -> Metrics:
         some = counts & (patches.white >= least) & (patches.white < most)
         figures[f"iou_{name}"] = float(iou[some].mean()) if some.any() else math.nan
     return figures
+
+
+@torch.no_grad()
+def measure_masses(network: nn.Module, scans: Scans) -> Metrics:
+    """Figures of the network of masses.
+
+    `iou`: intersection over union of B-scans with a mass, mean, and over all their pixels together `iou_pixels`; `missed`: of
+    them, those where less than a tenth of the masses is found; `empty_right`: of B-scans without a mass, those whose answer is
+    less than 50 px; `false_px`: pixels of answers in these, mean.
+    """
+    network.eval()
+    parts = [_areas(network, scans.images[k : k + BATCH], scans.masks[k : k + BATCH]) for k in range(0, len(scans), BATCH)]
+    found, true, both, either, _ = (np.concatenate(column) for column in zip(*parts, strict=True))
+    counts, empty = true >= LEAST_PX, true == 0
+    return {
+        "scans": len(scans),
+        "iou": float((both[counts] / either[counts]).mean()) if counts.any() else math.nan,
+        "iou_pixels": _share_of(both[counts].sum(), either[counts].sum()),
+        "missed": _share(both[counts] < 0.1 * true[counts]),
+        "empty_right": _share(found[empty] < LEAST_PX),
+        "false_px": float(found[empty].mean()) if empty.any() else math.nan,
+        "empty_scans": int(empty.sum()),
+    }
 
 
 LEAST_PX = 50  # of a mask that is one

@@ -21,6 +21,7 @@ from recon.errors import InputError, short, validated
 from recon.files import json_text, tar_members
 from recon.model import circle_layout
 from recon.model.rig import Target
+from trainers.scan_reader import Scans
 from trainers.shard_truth import (
     UNNAMED,
     Array,
@@ -87,7 +88,7 @@ class Patches:
         return len(self.images)
 
 
-Data = Views | Patches
+Data = Views | Patches | Scans
 Some = TypeVar("Some", bound=Data)
 
 
@@ -163,7 +164,7 @@ def joined(parts: Sequence[Some]) -> Some:
 
 def _with_circles(data: Some, circles: int) -> Some:
     """The same; views with columns of that many circles, the further ones those of targets that aren't there."""
-    if isinstance(data, Patches):
+    if not isinstance(data, Views):
         return data
     nothing = {"centres": np.nan, "visible": 0.0, "inside": False, "blur": 0.0, "identity": UNNAMED, "body": -1}
     columns = {}
@@ -203,7 +204,7 @@ def split(data: Some, validation: float) -> tuple[Some, Some]:
 
 
 def chosen(data: Some, which: NDArray) -> Some:
-    """The views or patches that a mask or an index selects."""
+    """The views, patches or B-scans that a mask or an index selects."""
     columns = {field.name: getattr(data, field.name) for field in fields(data)}
     return replace(
         data, **{name: some.chosen(which) if isinstance(some, StoredImages) else some[which] for name, some in columns.items()}
@@ -212,7 +213,7 @@ def chosen(data: Some, which: NDArray) -> Some:
 
 def bytes_decoded(data: Data) -> int:
     """Memory that the images of a data set take."""
-    images = (data.images, data.masks) if isinstance(data, Patches) else (data.images,)
+    images = (data.images, data.masks) if not isinstance(data, Views) else (data.images,)
     return sum(int(np.prod(some.shape)) for some in images)
 
 

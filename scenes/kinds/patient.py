@@ -4,13 +4,12 @@ Masses lie in what has grown as they are: touching, in clusters, in gland or fat
 that of the breast phantom.
 """
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import trimesh
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -75,6 +74,7 @@ FORMS: tuple[MassForm, ...] = ("round", "oval", "lobulated", "irregular", "spicu
 """of masses that are drawn"""
 COMMON: tuple[Pattern, ...] = ("anechoic", "hypoechoic", "hypoechoic", "hyperechoic")
 """patterns of drawn ones with an even border, but for round ones, which are cysts; others are hypoechoic"""
+PATTERNS, BEHIND = get_args(Pattern), get_args(Behind)
 BEHIND_DARK: tuple[Behind, ...] = ("none", "shadow")
 """what lies behind drawn hypoechoic ones"""
 
@@ -120,6 +120,32 @@ USUAL = (
 """masses where none are given: a cancer, a cyst and a fibroadenoma"""
 
 
+class DrawnMasses(Part):
+    """How many masses are drawn, how large, where their middles may lie in the breast's frame, and of which kinds."""
+
+    count: tuple[Annotated[int, Field(ge=0, le=20)], Annotated[int, Field(ge=0, le=20)]] = (2, 3)
+    """fewest and most: some to be told apart, with room between them"""
+    size_mm: tuple[Annotated[float, Field(ge=2, le=80)], Annotated[float, Field(ge=2, le=80)]] = (8.0, 20.0)
+    """least and most greatest extent: cancers of stage T1 are up to 20; the least assumed"""
+    beside_mm: tuple[Positive, Positive] = (38.0, 26.0)
+    """along x and y, to both sides; beyond, the usual breast has no room for most"""
+    above_mm: tuple[Positive, Positive] = (14.0, 38.0)
+    """over the chest: nearly all that is free in the usual breast, which is 52 high"""
+    apart_mm: NotNegative = 3.0
+    """at least, between spheres of their sizes about two: none touch in B-scans; assumed"""
+    any_words: bool = False
+    """whether any form may have any echoes and anything behind it, or only those that are usual together"""
+    tries: Annotated[int, Field(ge=1, le=100_000)] = 200
+    """until there is said to be no room; at most 8 were needed in 40 usual breasts, 52 in small ones"""
+
+    @field_validator("count", "size_mm", "above_mm")
+    @classmethod
+    def _ordered(cls, pair: tuple[float, float]) -> tuple[float, float]:
+        if pair[0] > pair[1]:
+            raise ValueError(f"expected the least and the most, found {pair[0]:g} and {pair[1]:g}")
+        return pair
+
+
 class Config(Outside):
     """A patient's breast: its outside, its anatomy and its masses."""
 
@@ -129,9 +155,10 @@ class Config(Outside):
     roughness: Annotated[float, Field(gt=0, le=1)] = 0.45
     anatomy: Anatomy = Anatomy()
     masses: tuple[Mass, ...] | Literal["drawn"] | None = None
-    """each by hand, or `drawn`: two or three by the seed; if not given, the usual three, or drawn ones in each of many sweeps"""
+    """each by hand, or drawn by the seed; if not given, the usual three, or drawn ones in each of many sweeps"""
     least_mm: Annotated[float, Field(ge=0, le=20)] = 2.0
     """of tissue between a mass and the skin or the chest"""
+    drawn: DrawnMasses = DrawnMasses()
     chest_reflectance: Fraction = 0.45
 
 
@@ -179,27 +206,15 @@ def skin_of(config: Config) -> Dome:
     return dome(form_of(config), _streams(config)[0])
 
 
-@dataclass(frozen=True)
-class DrawnMasses:
-    """How many masses are drawn, how large, and where their middles may lie in the breast's frame."""
-
-    count: tuple[int, int] = (2, 3)  # fewest and most: some to be told apart, with room between them
-    size_mm: tuple[float, float] = (8.0, 20.0)  # greatest extent: cancers of stage T1 are up to 20; the least assumed
-    beside_mm: tuple[float, float] = (38.0, 26.0)  # along x and y, to both sides; beyond, the usual breast has no room for most
-    above_mm: tuple[float, float] = (14.0, 38.0)  # over the chest: nearly all that is free in the usual breast, which is 52 high
-    apart_mm: float = 3.0  # at least, between spheres of their sizes about two: none touch in B-scans; assumed
-    tries: int = 200  # until there is said to be no room; at most 8 were needed in 40 usual breasts, 52 in small ones
-
-
-def draw_masses(config: Config, skin: Dome, rng: np.random.Generator, limits: DrawnMasses = DrawnMasses()) -> tuple[Mass, ...]:
-    """Draw masses, apart from each other, whose words go together.
+def draw_masses(config: Config, skin: Dome, rng: np.random.Generator) -> tuple[Mass, ...]:
+    """Draw masses, apart from each other, as `config.drawn` says.
 
     Raises
     ------
     InputError
         If no place is found for them.
     """
-    masses, below_skin = list[Mass](), depth_in(open_mesh(skin))
+    limits, masses, below_skin = config.drawn, list[Mass](), depth_in(open_mesh(skin))
     wanted = int(rng.integers(*limits.count, endpoint=True))
     (x, y), (lowest, highest) = limits.beside_mm, limits.above_mm
     for _ in range(limits.tries):
@@ -214,6 +229,8 @@ def draw_masses(config: Config, skin: Dome, rng: np.random.Generator, limits: Dr
             pattern = COMMON[rng.integers(len(COMMON))]
         dark = BEHIND_DARK[rng.integers(len(BEHIND_DARK))]
         behind: Behind = "enhancement" if pattern == "anechoic" else dark if pattern == "hypoechoic" else "none"
+        if limits.any_words:
+            pattern, behind = PATTERNS[rng.integers(len(PATTERNS))], BEHIND[rng.integers(len(BEHIND))]
         one = Mass(size_mm=size, centre_mm=tuple(centre.tolist()), form=form, pattern=pattern, behind=behind)
         if any(np.linalg.norm(centre - other.centre_mm) < (size + other.size_mm) / 2 + limits.apart_mm for other in masses):
             continue

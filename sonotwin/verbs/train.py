@@ -35,7 +35,7 @@ from recon.model import circle_layout
 from recon.model.rig import Target
 from sonotwin.console_watch import LineConsole
 from sonotwin.folder_lists import Folders, listed
-from trainers import data_sets, export, fit, free_memory, shard_reader
+from trainers import data_sets, export, fit, free_memory, scan_reader, shard_reader
 from trainers.architectures import Name, is_detector, network
 from trainers.batches import SCALES
 from trainers.checkpoints import TRAIN
@@ -145,8 +145,8 @@ def _train(config: Config, console: Console) -> None:
     goes_on = check_resumed(config)
     torch.set_num_threads(config.threads or cores.usable())
     torch.manual_seed(config.seed)
-    kind = shard_reader.kind_of([*config.data, *(config.validation_data or ())])
-    module = network(config.network, circle_layout.count(Target.named(kind)))
+    kind = "" if config.network == "masses" else shard_reader.kind_of([*config.data, *(config.validation_data or ())])
+    module = network(config.network, circle_layout.count(Target.named(kind)) if kind else 0)
     if config.init is not None:
         export.load(config.init, module)
     train, validation = read(config, console)
@@ -211,7 +211,11 @@ def prepare(config: Config, goes_on: bool) -> None:
 
 def read(config: Config, console: Console) -> tuple[Data, Data]:
     """Training and validation samples, in memory as far as they may be."""
-    reader = data_sets.read_views if is_detector(config.network) else data_sets.read_patches
+    reader, what = data_sets.read_patches, "patches"
+    if is_detector(config.network):
+        reader, what = data_sets.read_views, "views"
+    elif config.network == "masses":
+        reader, what = (lambda folders, tell=lambda count: None, partial=False: scan_reader.read_scans(folders, tell)), "B-scans"
     with console.status("reading") as status:
         data = reader(config.data, lambda count: status.update(f"reading, {count} samples"), config.partial)
         if config.validation_data is not None:
@@ -220,7 +224,6 @@ def read(config: Config, console: Console) -> tuple[Data, Data]:
             sets = shard_reader.split(data, config.validation)
         memory = config.memory
         train, validation = shard_reader.as_fits(sets, memory, lambda count: status.update(f"decoding, {count} images"))
-    what = "views" if is_detector(config.network) else "patches"
     console.print(f"read        {len(train)} {what} to train with, {len(validation)} to validate with", markup=False)
     if isinstance(train.images, StoredImages):
         needed = shard_reader.bytes_decoded(train) / 1e9
@@ -247,6 +250,11 @@ def describe(figures: Metrics) -> str:
             f"{shown(100 * figures['all_three'], '.1f', ' %')} of views with all circles, "
             f"median {shown(figures['place_median_full_px'], '.2f', ' px')} off in full resolution, "
             f"{shown(figures['false_per_empty_view'], '.2f')} false circles an empty view"
+        )
+    if "iou_pixels" in figures:
+        return (
+            f"IoU {shown(figures['iou'], '.3f')}, {shown(100 * figures['missed'], '.1f', ' %')} of B-scans with a mass missed, "
+            f"{shown(100 * figures['empty_right'], '.1f', ' %')} of empty ones right"
         )
     return (
         f"IoU {shown(figures['iou'], '.3f')}, centres {shown(figures['centre_median_px'], '.2f', ' px')} off, "

@@ -103,14 +103,24 @@ def test_the_words_of_drawn_masses_go_together(drawn):
         assert one.pattern == "hypoechoic" or (one.behind != "shadow" and one.form in CIRCUMSCRIBED)
 
 
+def test_any_words_may_be_drawn():
+    """Also cysts before a shadow and spiculated bright ones; as many and as large as asked for."""
+    drawn = {"any_words": True, "count": (3, 4), "size_mm": (6.0, 8.0), "tries": 2000}
+    configs = [patient.Config(**COARSE, seed=seed, drawn=drawn) for seed in range(8)]
+    masses = [patient.draw_masses(one, patient.skin_of(one), np.random.default_rng(one.seed)) for one in configs]
+    assert all(3 <= len(some) <= 4 and all(6 <= one.size_mm <= 8 for one in some) for some in masses)
+    assert len({(one.pattern, one.behind) for some in masses for one in some}) > 9  # of 15
+    with pytest.raises(ValueError, match=r"expected the least and the most, found 4 and 3"):
+        patient.DrawnMasses(count=(4, 3))
+
+
 def test_a_draw_searches_one_tree(monkeypatch):
     """However many places it tries; no room is said if there is none."""
     made, tree = [], breast.surface_tree
     monkeypatch.setattr(breast, "surface_tree", lambda points: made.append(len(points)) or tree(points))
-    config = patient.Config(**COARSE, least_mm=20.0)
-    limits = patient.DrawnMasses(size_mm=(10.0, 11.0), tries=4)
+    config = patient.Config(**COARSE, least_mm=20.0, drawn={"size_mm": (10.0, 11.0), "tries": 4})
     with pytest.raises(InputError, match=r"^masses: expected room for [23] drawn ones, found it for 0; give them,"):
-        patient.draw_masses(config, patient.skin_of(config), np.random.default_rng(5), limits)
+        patient.draw_masses(config, patient.skin_of(config), np.random.default_rng(5))
     assert len(made) == 1
 
 
