@@ -26,6 +26,7 @@ from twin.ultrasound.transducer import Transducer
 Array = NDArray[np.float64]
 
 RATE_HZ = 100.0  # of the poses that make up a path
+SEARCH_MM = 0.1  # steps in which a surface is looked for
 MOST_S = 3600.0  # of a path
 Rest = Annotated[float, Field(ge=0, le=60)]  # s
 CALM = tremor.draw(0.0, 0.0, 0)  # a hand without tremor
@@ -390,17 +391,35 @@ def _place(path: SurfacePath | Hold, place: Array, solid: Solid, transducer: Tra
 
 
 def top(solid: Solid, places: Array) -> Array:
-    """Z of a solid's side that faces the cameras, at x, y : (n, 2) mm; NaN beside it."""
+    """Z of a solid's side that faces the cameras, at x, y : (n, 2) mm; NaN beside it.
+
+    A distance falls by no more than the way, so that lines are searched finely only from where the solid is near.
+    """
     low, high = solid.mesh.bounds[:, 2]
-    search_mm = 0.1  # steps in which the surface is looked for
-    depths = np.arange(low - 1, high, search_mm)
-    points = np.concatenate([np.repeat(places, len(depths), axis=0), np.tile(depths, len(places))[:, None]], axis=1)
-    distance = solid.distances(points).reshape(len(places), -1)
+    depths = np.arange(low - 1, high, SEARCH_MM)
+    coarse, near_mm, window = 10, 2.0, 60  # steps from one look to the next, at which it may be near, and that are searched then
+    looks = _along(solid, places, np.broadcast_to(depths[::coarse], (len(places), len(depths[::coarse]))))
+    begin = coarse * np.maximum((looks < near_mm).argmax(axis=1) - 1, 0)
+    result = _first_below(solid, places, depths[np.minimum(begin[:, None] + np.arange(window), len(depths) - 1)])
+    missed = np.isnan(result) & (looks < near_mm).any(axis=1)
+    result[missed] = _first_below(solid, places[missed], np.broadcast_to(depths, (missed.sum(), len(depths))))
+    return result
+
+
+def _along(solid: Solid, places: Array, depths: Array) -> Array:
+    """Signed distances : (n, m) to a solid at places : (n, 2) and depths : (n, m)."""
+    points = np.concatenate([np.repeat(places, depths.shape[1], axis=0), depths.reshape(-1, 1)], axis=1)
+    return solid.distances(points).reshape(depths.shape)
+
+
+def _first_below(solid: Solid, places: Array, depths: Array) -> Array:
+    """Z : (n,) at which a line at x, y enters a solid, between the depths : (n, m); NaN where it doesn't."""
+    distance, rows = _along(solid, places, depths), np.arange(len(places))
     first = (distance < 0).argmax(axis=1)
-    rows = np.arange(len(places))
-    before, after = distance[rows, np.maximum(first - 1, 0)], distance[rows, first]
+    last = np.maximum(first - 1, 0)
+    before, after = distance[rows, last], distance[rows, first]
     share = before / np.where(before == after, 1, before - after)
-    return np.where(first > 0, depths[np.maximum(first - 1, 0)] + share * search_mm, np.nan)
+    return np.where(first > 0, depths[rows, last] + share * SEARCH_MM, np.nan)
 
 
 def _led(faces: Array, hand: Hand, shaken: Tremor, transducer: Transducer, seed: int) -> Track:
