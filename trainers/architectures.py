@@ -166,7 +166,7 @@ class Segmenter(nn.Module):
 class MassSegmenter(nn.Module):
     """Ours: a U-Net of five levels; what lies around and behind tells masses from lobules, so the last sees a whole B-scan."""
 
-    def __init__(self, channels: tuple[int, ...] = (12, 24, 48, 96, 96)) -> None:
+    def __init__(self, channels: tuple[int, ...] = (16, 32, 64, 128, 128)) -> None:
         super().__init__()
         self.down = nn.ModuleList(DoubleConv(*pair) for pair in pairwise((1, *channels)))
         wider = channels[::-1]
