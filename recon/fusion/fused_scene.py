@@ -17,6 +17,7 @@ from recon.geometry.camera import Camera
 from recon.model.rig import Target
 from recon.segmentation.left_out import LeftOut
 from recon.segmentation.mass_files import FoundMass
+from recon.segmentation.seen_map import SeenFiles
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,7 @@ class FusedScene:
     devices: Mapping[str, Camera] = field(default_factory=dict)
     search_failed: str = ""  # why the search for masses failed
     left_out: Sequence[LeftOut] = ()  # by that search, where a mass may be missing
+    seen: SeenFiles | None = None  # the map of where masses would have been found
 
     @property
     def search(self) -> str:
@@ -75,6 +77,8 @@ def layers(scene: FusedScene, scans: int) -> dict[str, trimesh.Trimesh]:
     if scene.rest is not None:
         made["table"] = surface_layer(scene.rest, IN_SPACE.table, GREY_TABLE)
     made |= {name: painted(mass.mesh, IN_SPACE.mass) for name, mass in (scene.masses or {}).items()}
+    if scene.seen is not None and scene.seen.unseen is not None:
+        made["unseen"] = painted(scene.seen.unseen, IN_SPACE.unseen)
     for k in evenly(list(scene.images), scans):
         made[f"scan{k:04d}"] = scan_layer(scene.images[k], scene.scans.world_from_pixel[k])
     if len(scene.path):

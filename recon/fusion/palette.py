@@ -17,6 +17,7 @@ class Palette(Generic[Colour]):
     device: Colour
     body: Colour  # of the probe and its target
     ink: Colour  # of the target's circles
+    unseen: Colour  # places that are still to be scanned
 
 
 IN_SPACE = Palette(  # red, green, blue and opacity, 0 to 255: of models on dark ground
@@ -27,7 +28,15 @@ IN_SPACE = Palette(  # red, green, blue and opacity, 0 to 255: of models on dark
     device=(90, 90, 90, 255),
     body=(235, 235, 235, 255),
     ink=(20, 20, 20, 255),
+    unseen=(240, 180, 60, 70),
 )
 ON_PAGE = Palette(  # lighter, of a page's white ground
-    skin="#f2e0d2", table="#c9bfb2", mass="#c8553d", path="#3c8cdc", device="#5a5a5a", body="#d8d8d4", ink="#202020"
+    skin="#f2e0d2",
+    table="#c9bfb2",
+    mass="#c8553d",
+    path="#3c8cdc",
+    device="#5a5a5a",
+    body="#d8d8d4",
+    ink="#202020",
+    unseen="#e0a030",
 )

@@ -17,6 +17,7 @@ from recon.reports.page import Opening, Section
 from recon.reports.space_views import Lines, Shape
 from recon.reports.sweep_player import Reel
 from recon.segmentation.mass_files import FoundMass
+from recon.segmentation.seen_map import Table
 
 Array = NDArray[np.float64]
 
@@ -81,6 +82,9 @@ def _bodies(scene: FusedScene) -> Iterator[Shape]:
     for name, mass in (scene.masses or {}).items():
         coarse = merged(mass.mesh, STEP_MM / 2)
         yield Shape(name, coarse.vertices, coarse.faces, ON_PAGE.mass)
+    if scene.seen is not None and scene.seen.unseen is not None:
+        mesh = scene.seen.unseen
+        yield Shape("unseen", mesh.vertices, mesh.faces, ON_PAGE.unseen, 0.25, shown=False)  # it lies about all the rest
 
 
 def _wires(scene: FusedScene) -> Iterator[Lines]:
@@ -98,7 +102,7 @@ def _wires(scene: FusedScene) -> Iterator[Lines]:
 
 
 def numbers(scene: FusedScene) -> Iterator[Section]:
-    """The masses, and what was left out, in tables, if there are any."""
+    """The masses, what was left out, and what was seen, in tables, if there are any."""
     if scene.masses:
         head = ("", "centre x, y, z, mm", "volume, mm³", "below the skin, mm")
         rows = [(name, *row_of(mass)) for name, mass in scene.masses.items()]
@@ -111,6 +115,22 @@ def numbers(scene: FusedScene) -> Iterator[Section]:
             for one in scene.left_out
         ]
         yield Section("Left out", [page.table(head, listed, "Where a mass may be that isn't measured.")])
+    if scene.seen is not None:
+        yield seen_table(scene.seen.table)
+
+
+def seen_table(table: Table) -> Section:
+    """For each size and contrast the share of what was scanned in which such a mass would have been found."""
+    head = ("mass", *(f"{contrast:g} dB" for contrast in table.contrasts_db))
+    rows = [
+        (f"{size:g} mm", *(f"{100 * share:.0f} %" for share in shares))
+        for size, shares in zip(table.sizes_mm, table.shares, strict=True)
+    ]
+    told = "Share of what was scanned in which a mass of that size and contrast would have been found whole, had it been there."
+    told += (
+        f" The layer unseen, off at first, holds places where one of {table.size_mm:g} mm and {table.contrast_db:g} dB wouldn't."
+    )
+    return Section("Seen", [page.table(head, rows, told)])
 
 
 def row_of(mass: FoundMass) -> tuple[str, str, str]:

@@ -60,6 +60,8 @@ def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
     if scene.rest is not None:
         yield "table", merged(scene.rest, STEP_MM)
     yield from ((name, mass.mesh) for name, mass in (scene.masses or {}).items())
+    if scene.seen is not None and scene.seen.unseen is not None:
+        yield "unseen", scene.seen.unseen
     if len(scene.path):
         yield "path", path_layer(scene.path)
     yield from ((name, device_layer(camera)) for name, camera in scene.devices.items())

@@ -20,13 +20,16 @@ from recon.navigation.mass_distances import MassDistance
 from recon.navigation.own_pages import own_pages_alone
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import BodyAt, Moment, StillScene
+from recon.navigation.seen_so_far import SeenSoFar
 from recon.navigation.tool_figures import Alarms
 from recon.own_requests import LOOPBACK
+from recon.segmentation.seen_map import POORLY
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 TOOL, PLAN = (90, 205, 255), (120, 230, 120)  # colours of tools, in space and in the B-scan, and of the planned path
+UNSEEN, HALF_SEEN, POINT_MM = (240, 150, 40), (250, 225, 150), 0.5  # colours and size of points that are still to be scanned
 PLAN_MM, AIM_MM = 0.5, 2.0  # radii of the path's line and of its aim
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
 FONT, NAME_GAP_PX = (cv2.FONT_HERSHEY_SIMPLEX, 0.5), 4  # of the names, and between them and the outlines
@@ -58,6 +61,8 @@ class BrowserView:
         self._scan: viser.ImageHandle | None = None  # of the B-scan in space, as soon as there is one
         self._shown: PlacedScan | None = None
         self._picture: Picture | None = None  # of that
+        self._seen: SeenSoFar | None = None
+        self._unseen: viser.PointCloudHandle | None = None  # places that are still to be scanned
         self._scene, self._alarms = scene, alarms or Alarms()
         with ExitStack() as stack:
             with own_pages_alone(host), redirect_stdout(StringIO()):  # it prints, even so
@@ -85,6 +90,7 @@ class BrowserView:
             for name, handle in self._tools.items():
                 _show(handle, tool_figures.body_of(moment, name).world_from_body)
             self._show_scan(moment.scan, moment.distances)
+            self._show_unseen(moment.seen)
             if monotonic() - self._written > figures_s:  # figures and picture of one moment
                 self._written = monotonic()
                 picture = None if self._picture is None else with_tools(self._picture, moment.bodies)
@@ -105,6 +111,16 @@ class BrowserView:
         if self._scan is not None:
             self._scan.visible = scan is not None
 
+    def _show_unseen(self, seen: SeenSoFar | None) -> None:
+        """Show places that are still to be scanned; they vanish as they are seen well enough."""
+        if seen is self._seen:
+            return
+        self._seen = seen
+        points = np.empty((0, 3), np.float32) if seen is None else seen.points
+        colours = np.empty((0, 3), np.uint8) if seen is None else colours_of(seen)
+        places, size = points * np.float32(M), POINT_MM * M
+        self._unseen = self._server.scene.add_point_cloud("/unseen", places, colours, point_size=size, point_shape="circle")
+
     def _place(self, scan: PlacedScan, picture: Picture) -> None:
         """Show a B-scan where it was taken, to the borders of its outer pixels."""
         (height, width), (across, down) = scan.image.shape, np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0) * M
@@ -116,6 +132,11 @@ class BrowserView:
         else:
             self._scan.image = picture
         self._scan.wxyz, self._scan.position = turn_of(scan.world_from_pixel), scan.corners.mean(axis=0) * M
+
+
+def colours_of(seen: SeenSoFar) -> NDArray[np.uint8]:
+    """Colours : (n, 3) of places that are still to be scanned, paler where a mass would be found sooner than not."""
+    return np.where((seen.probability < POORLY)[:, None], UNSEEN, HALF_SEEN).astype(np.uint8)
 
 
 def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:

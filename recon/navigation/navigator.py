@@ -22,6 +22,7 @@ from recon.navigation.moving_bodies import MovingBodies, Placed, state_of
 from recon.navigation.newest import Every, Newest
 from recon.navigation.placed_scans import PlacedScan, ScanPlacing
 from recon.navigation.publishing import BodyAt, Moment, Outlet, Publisher
+from recon.navigation.seen_so_far import Mapper, SeenSoFar
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker, Tracking
 
@@ -53,6 +54,7 @@ class Navigator:
     again_s: float = 1.0  # until a device that was lost is opened again
     moving: MovingBodies = field(default_factory=lambda: MovingBodies({}))  # of a tracker of several bodies
     recorders: Sequence[Publisher] = ()  # that get every moment
+    mapper: Mapper | None = None  # of what was seen
     outlets: list[Outlet] = field(init=False)
     feeds: list[Feed] = field(init=False)
     pairs: Newest[FramePair] = field(default_factory=Newest, init=False)
@@ -73,7 +75,7 @@ class Navigator:
 
     def start(self) -> None:
         """Open the devices, and begin."""
-        for each in (*self.outlets, *self.feeds):
+        for each in self._threads:
             each.start()
         self._thread = Thread(target=self._run, name="tracking", daemon=True)
         self._thread.start()
@@ -83,10 +85,14 @@ class Navigator:
         self._stopped.set()
         self.pairs.close()
         with ExitStack() as stack:
-            for each in (*self.outlets, *self.feeds):
+            for each in self._threads:
                 stack.callback(each.stop)
             if self._thread is not None:
                 self._thread.join()
+
+    @property
+    def _threads(self) -> list[Outlet | Feed | Mapper]:
+        return [*self.outlets, *self.feeds, *([] if self.mapper is None else [self.mapper])]
 
     @property
     def running(self) -> bool:
@@ -102,7 +108,8 @@ class Navigator:
             if self._stopped.is_set():
                 return
             if pair is None:
-                self._publish(Moment(number, monotonic_ns(), None, "no frames of both cameras", troubles=self._troubles()))
+                why, troubles = "no frames of both cameras", self._troubles()
+                self._publish(Moment(number, monotonic_ns(), None, why, troubles=troubles, seen=self._seen))
                 continue
             number += 1
             found = self.tracker.step(pair.left.frame.image, pair.right.frame.image, pair.exposed_ns * 1e-9)
@@ -110,6 +117,8 @@ class Navigator:
             self._placing.add_pose(pair.exposed_ns, NO_POSE if placed.world_from_target is None else placed.world_from_target)
             if (newer := self._placing.newest()) is not None:
                 scan, distances = newer, mass_distances.distances(self.bodies, newer)
+                if self.mapper is not None:
+                    self.mapper.add(newer)
             elif scan is not None and pair.exposed_ns - scan.taken_ns > stale_ns + self.lag_s * 1e9:
                 scan, distances = None, ()
             bodies = self.moving.measure(placed, scan)
@@ -132,7 +141,12 @@ class Navigator:
         pose, state = placed.world_from_target, placed.state
         latency = self.outlets[0].latencies.figures() if self.outlets else None
         frame_ns = pair.left.frame.time_ns
-        return Moment(number, pair.exposed_ns, pose, state, scan, distances, self._troubles(), latency, bodies, frame_ns)
+        known = self._troubles(), latency, bodies, frame_ns, self._seen
+        return Moment(number, pair.exposed_ns, pose, state, scan, distances, *known)
+
+    @property
+    def _seen(self) -> SeenSoFar | None:
+        return None if self.mapper is None else self.mapper.newest
 
     def _troubles(self) -> tuple[str, ...]:
         return tuple(feed.trouble for feed in self.feeds if feed.trouble is not None)

@@ -17,6 +17,7 @@ from recon.model.tip import Tip
 from recon.navigation.mass_distances import MassDistance
 from recon.navigation.newest import Newest
 from recon.navigation.placed_scans import PlacedScan
+from recon.navigation.seen_so_far import SeenSoFar
 from recon.navigation.tool_distances import TipFigures
 
 log = logging.getLogger(__name__)
@@ -72,6 +73,7 @@ class Moment:
     latency: Latency | None = None  # of the moments before
     bodies: tuple[BodyAt, ...] = ()  # besides the probe
     frame_ns: int | None = None  # of camera 1's frame, by its own clock; None without frames
+    seen: SeenSoFar | None = None  # of the B-scans before; None where it isn't mapped
 
     @property
     def places_any(self) -> bool:

@@ -40,6 +40,7 @@ class Segmented:
     lines: list[str]  # for the console
     overlays: list[Overlay]
     left_out: tuple[LeftOut, ...] = ()  # by a search for masses
+    scans: Scans | None = None  # in which masses were sought: as of the body at rest
 
 
 def find_masses(
@@ -94,7 +95,7 @@ def find_masses(
             figures[f"mass{number}_left_sigma_mm"] = sigma.left_mm
             lines += rest.warnings_of(f"mass{number}", sigma.left_mm)
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
-    return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn, tuple(left_out))
+    return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn, tuple(left_out), scans)
 
 
 def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> Metrics:

@@ -17,11 +17,12 @@ from recon.freehand.scans import Scans, ScansFields
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import Positive
-from recon.segmentation import containment, left_out, segmented_scans
+from recon.segmentation import containment, detectability, left_out, seen_map, segmented_scans
+from recon.segmentation.seen_map import Seen
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
 from recon.session import volume_step
-from recon.session.settings import EchoFields
+from recon.session.settings import EchoFields, SoughtFields
 from recon.session.watch import SILENT, Watch
 
 BY = "segment"  # who writes
@@ -59,7 +60,7 @@ class Method(EchoFields):
         return Appearance(self.diameter_mm, self.spread_mm, self.dynamic_range_db, self.min_contrast_db, self.top_mm)
 
 
-class Settings(Method, ScansFields):
+class Settings(Method, SoughtFields, ScansFields):
     """Sources, and settings of the method."""
 
     clip: Rectangle | None = None
@@ -90,6 +91,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         watch.say(f"warning     {line}")
     start = perf_counter()
     found = find(scans, settings, skin, settings.unsure.tissue_m_s, source, watch)
+    mapped = map_seen(found, settings, skin, watch)
     figures: Metrics = {
         "frames": len(scans.world_from_pixel),
         "frames_placed": scans.placed,
@@ -102,6 +104,9 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
             meshes.write_glb(folder / f"{name}.glb", mesh)
         if settings.kind == "masses":
             left_out.write(folder / left_out.FILE, found.left_out)
+        if mapped is not None:
+            seen_map.write(folder, mapped)
+            figures |= mapped.figures
         for number, image in enumerate(found.overlays):
             (folder / f"overlay{number}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
         metrics.write(folder / metrics.FILE, figures | found.figures | {"seconds_segment": round(perf_counter() - start, 3)})
@@ -145,6 +150,17 @@ def find(
     for line in found.lines:
         watch.say(line)
     return found
+
+
+def map_seen(found: Segmented, settings: Settings, skin: trimesh.Trimesh | None = None, watch: Watch = SILENT) -> Seen | None:
+    """Map what was seen in the B-scans in which masses were sought; None where none were."""
+    if found.scans is None:
+        return None
+    uneven_db = found.figures.get("tissue_uneven_db", detectability.OBSERVER.even_db)
+    with watch.busy("mapping what was seen"):
+        mapped = seen_map.of_scans(found.scans, skin, settings.spreads, settings.sought, uneven_db)
+    watch.say(mapped.line)
+    return mapped
 
 
 def read(settings: Settings) -> Scans:

@@ -21,7 +21,7 @@ from recon.model.probe import Speed
 from recon.model.rig import Part, Rig
 from recon.model.tracks import LagSeconds
 from recon.registry import Choice
-from recon.segmentation import containment, left_out, mass_files
+from recon.segmentation import containment, left_out, mass_files, seen_map
 from recon.session import volume_step
 from recon.session.watch import SILENT, Watch
 
@@ -118,6 +118,7 @@ def read(settings: Settings) -> FusedScene:
         None if settings.masses is None else mass_files.read_masses(settings.masses),
         {} if optics is None else optics.cameras,
         left_out=[one for one in missing if one.reason not in left_out.UNLIKELY],
+        seen=None if settings.masses is None else seen_map.read(settings.masses),
     )
 
 
@@ -144,12 +145,14 @@ def parted(settings: Settings, surface: Path, optics: Calibration | None) -> Par
 
 def volumes(settings: Settings) -> dict[str, Path]:
     """Files of voxels, by name; InputError if the folder that is given has none of `sonotwin freehand`."""
+    mapped = None if settings.masses is None else settings.masses / seen_map.VOLUME
+    of_masses = {} if mapped is None or not mapped.is_file() else {mapped.stem: mapped}
     if settings.volume is None:
-        return {}
+        return of_masses
     names = (volume_step.VOLUME, volume_step.SIGMA)
     found = {Path(name).stem: settings.volume / name for name in names if (settings.volume / name).is_file()}
     if Path(volume_step.VOLUME).stem not in found:
         raise InputError(f"{settings.volume}: expected a folder of `sonotwin freehand`, found no {volume_step.VOLUME} in it")
     for path in found.values():
         read_volume(path)  # damaged ones are refused here, not by who opens the result
-    return found
+    return found | of_masses

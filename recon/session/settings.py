@@ -10,7 +10,9 @@ from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from recon.model.rig import NotNegative, Part, Positive, Probe
 from recon.segmentation.blur_correction import MOST_MM, Blur
+from recon.segmentation.detectability import Sought
 from recon.segmentation.echo_power import SLICE_MM, SPREAD_MM
+from recon.segmentation.insonation import Spread as Spreads
 
 Spread = Annotated[float, Field(gt=0, le=MOST_MM)]
 Spacing = Annotated[float, Field(ge=0.01, le=100)]  # mm, of a volume's voxels
@@ -107,6 +109,25 @@ class EchoFields(Part):
     def blur(self) -> Blur | None:
         """Blur of the B-scans that masses are corrected for."""
         return None if self.slice_mm is None else Blur(self.spread_mm[0], self.slice_mm)
+
+    @property
+    def spreads(self) -> Spreads:
+        """Extent of an echo in all three directions; across the plane that of the default array where it isn't given."""
+        return Spreads(*self.spread_mm, SLICE_MM if self.slice_mm is None else self.slice_mm)
+
+
+class SoughtFields(Part):
+    """Fields of a step that maps what was seen: the mass that would have been found there."""
+
+    seen_mm: Annotated[float, Field(ge=1, le=100)] = Sought.size_mm
+    """mm, diameter of a mass, for which places count as seen or not"""
+    seen_db: Annotated[float, Field(ge=0.5, le=60)] = Sought.contrast_db
+    """dB, by which that mass is darker than the tissue"""
+
+    @property
+    def sought(self) -> Sought:
+        """That mass."""
+        return Sought(self.seen_mm, self.seen_db)
 
 
 class ScaleFields(Part):

@@ -43,10 +43,12 @@ from recon.navigation.moving_bodies import MovingBodies
 from recon.navigation.navigation_record import RecordTable
 from recon.navigation.navigator import Navigator, warm_up
 from recon.navigation.publishing import Publisher, StillScene
+from recon.navigation.seen_so_far import Mapper, RunningMap
 from recon.navigation.slicer_publisher import IgtlSender, SlicerPublisher
 from recon.navigation.tool_figures import Alarms
 from recon.probe_calibration import sound_in_water
 from recon.session import poses_step
+from recon.session.settings import SoughtFields
 from recon.session.tracker_settings import BodyFields, make_rig_tracker, targets_of
 from recon.tracking.bodies import BodyTracker
 from recon.tracking.tracker import Tracker
@@ -71,7 +73,7 @@ class Igtl(Part):
     """of TCP: the one registered for OpenIGTLink; give another beside a PlusServer; 0 takes any that is free"""
 
 
-class Config(LiveFields, BodyFields):
+class Config(LiveFields, BodyFields, SoughtFields):
     """Fields of `sonotwin navigate`."""
 
     probe: Path | None = None
@@ -95,6 +97,8 @@ class Config(LiveFields, BodyFields):
     """mm in the world, a path's entry and aim: [[x,y,z],[x,y,z]]"""
     alarm: Alarms = Alarms()
     """when a tool's row on the page is an alarm"""
+    unseen: bool = True
+    """show what is still to be scanned: under the skin, or around what was touched; false: not"""
     record: Path | None = None
     """table, a new .csv: each moment's poses of all bodies, and tools' figures"""
     view: View = View()
@@ -149,9 +153,8 @@ def run(config: Config) -> int:
     moving = MovingBodies(tools, surfaces, plan, reference)
     publishers, recorders = publishers_of(config, scene, console)
     cameras = sources.cam1, sources.cam2
-    navigator = Navigator(
-        cameras, sources.scanner, tracker, probe, config.lag_s, masses, publishers, moving=moving, recorders=recorders
-    )
+    more = {"moving": moving, "recorders": recorders, "mapper": mapper_of(config, scene, probe)}
+    navigator = Navigator(cameras, sources.scanner, tracker, probe, config.lag_s, masses, publishers, **more)
     try:
         navigator.start()
         until = monotonic() + (config.seconds or float("inf"))
@@ -161,6 +164,11 @@ def run(config: Config) -> int:
     finally:
         navigator.stop()
         tell(navigator, console)
+
+
+def mapper_of(config: Config, scene: StillScene, probe: ProbeCalibration) -> Mapper | None:
+    """The map of what was seen, for the mass that is sought; None where it isn't to be shown."""
+    return Mapper(RunningMap(scene.skin, config.sought, face_row=probe.face_row)) if config.unseen else None
 
 
 def publishers_of(config: Config, scene: StillScene, console: Console) -> tuple[list[Publisher], list[Publisher]]:

@@ -4,8 +4,9 @@ Reads the sweep part of a capture folder, with the probe's calibration and the l
 sequence of the PLUS toolkit; and the skin as of `sonotwin surface`, a PLY, to check that masses lie inside, or to fit the round
 body about a tube, with the wall between both. Writes into the folder `out`: mass0.ply, mass1.ply ... from the largest on, or
 tube.ply and cover.ply, in the world's frame, mm; the same as .glb; some B-scans with the outline, overlay0.png ...;
-left_out.json, which lists what isn't measured, with place, size and reason; and metrics.json. Results that are there already
-are replaced. Takes a quarter of a minute for 150 B-scans, a tube some seconds.
+left_out.json, which lists what isn't measured, with place, size and reason; seen.nrrd, the probability that a mass would have
+been found there, with seen.json and unseen.ply; and metrics.json. Results that are there already are replaced. Takes a quarter of
+a minute for 150 B-scans, a tube some seconds.
 
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 tissue_m_s=1450 out=outputs/masses
     sonotwin segment capture=outputs/sweep/capture lag_s=0.05 surface=outputs/surface/surface.ply out=outputs/masses

@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from recon.files import meshes
+from recon.segmentation import insonation, seen_map
 from scenes.solid_meshes import grid
 from sonotwin.cli import main
-from tests.recon import sweep_sets
+from tests.recon import pose_stacks, sweep_sets
 
 
 @pytest.fixture
@@ -38,6 +39,17 @@ def test_layers_of_all_that_is_given(given, tmp_path):
     assert main(["fuse", *given, f"surface={tmp_path / 'skin.ply'}", f"masses={tmp_path / 'masses'}"]) == 0
     found = names(tmp_path / "out" / "scene.glb")
     assert found == ["circles", "mass0", "path", "probe", "scan0000", "scan0020", "scan0040", "skin"]
+
+
+def test_what_was_seen_is_shown_where_it_was_mapped(given, tmp_path):
+    """As a volume and a model for 3D Slicer, a layer, and a table of the page."""
+    mapped = seen_map.look(insonation.of_sweep(pose_stacks.stack(np.arange(-15, 15.1)), pose_stacks.SHAPE))
+    seen_map.write(tmp_path / "masses", mapped)
+    assert main(["fuse", *given, f"masses={tmp_path / 'masses'}"]) == 0
+    assert "unseen" in names(tmp_path / "out" / "scene.glb")
+    assert (tmp_path / "out" / "slicer" / "seen.nrrd").read_bytes() == (tmp_path / "masses" / "seen.nrrd").read_bytes()
+    assert (tmp_path / "out" / "slicer" / "unseen.ply").is_file()
+    assert "<h2>Seen" in (tmp_path / "out" / "scene.html").read_text(encoding="utf-8")
 
 
 def test_less_is_less(given, tmp_path):

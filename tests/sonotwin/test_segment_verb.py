@@ -10,10 +10,12 @@ from scipy.ndimage import gaussian_filter
 
 import sonotwin
 from recon.capture import sweep_part
+from recon.files import volumes
 from recon.freehand import sequences
 from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
+from recon.segmentation import seen_map
 from sonotwin.cli import main
 from tests.recon import captures, probe_motions, sweep_sets
 
@@ -120,6 +122,17 @@ def test_files(segmented):
     mesh = trimesh.load_mesh(segmented / "mass0.ply")
     figures = json.loads((segmented / "metrics.json").read_text())
     assert mesh.is_watertight and mesh.volume == pytest.approx(figures["mass0_volume_mm3"], rel=1e-3)
+
+
+def test_the_map_of_what_was_seen_holds_the_mass(segmented):
+    """A mass would have been found where one was, not at the images' side, nor where it would stand out of the skin."""
+    seen, figures = seen_map.read(segmented), json.loads((segmented / "metrics.json").read_text())
+    volume = volumes.read_volume(seen.volume)
+    places = CENTRE + np.array([[0, 0, 0], [15, 0, 0], [0, 0, -13]])
+    i, j, k = np.rint(rigid.apply(np.linalg.inv(volume.world_from_voxel), places)).astype(int).T
+    there, beside, above = volume.voxels[k, j, i]
+    assert there > 0.9 and beside < 0.5 and above == 0
+    assert figures["seen_mm3"] > 1000 and figures["unseen_mm3"] > 1000 and seen.unseen.is_watertight
 
 
 def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(capture, tmp_path, capsys):

@@ -22,6 +22,7 @@ from recon.geometry import rigid
 from recon.model.probe import ProbeCalibration
 from recon.segmentation.left_out import LeftOut
 from recon.segmentation.mass_files import FoundMass
+from recon.segmentation.seen_map import SeenFiles, Table
 
 FIGURES = {"centre_sigma_mm": 0.21, "volume_sigma_mm3": 12.0, "depth_mm": 7.5, "depth_sigma_mm": 0.19}
 
@@ -59,6 +60,20 @@ def test_what_was_left_out_is_a_point_with_its_reason(folder, scene):
     assert (point["label"], point["description"], point["position"]) == ("small", "is left out", [1.0, 2.0, 660.0])
     _, table = scene_page.numbers(scene)
     assert table.title == "Left out" and "1, 2, 660" in str(table)
+
+
+def test_what_was_seen_is_a_table_and_a_layer(scene, tmp_path):
+    """The unseen places are a model for 3D Slicer, a layer of the scene, and one of the page that is off at first."""
+    box = trimesh.creation.box((20, 30, 40)).apply_translation([5, 0, 670])
+    table = Table(size_mm=8, contrast_db=8, sizes_mm=(4.0, 8.0), contrasts_db=(5.0, 15.0), shares=((0.1, 0.254), (0.5, 1.0)))
+    seen = replace(scene, seen=SeenFiles(tmp_path / "seen.nrrd", table, box))
+    slicer_folder.write(tmp_path / "slicer", seen, {}, scans=1)
+    assert trimesh.load_mesh(tmp_path / "slicer" / "unseen.ply").bounds == pytest.approx(box.bounds)
+    assert fused_scene.layers(seen, 1)["unseen"].bounds == pytest.approx(box.bounds)
+    *_, section = scene_page.numbers(seen)
+    assert section.title == "Seen" and all(word in section.blocks[0] for word in ("8 mm", "15 dB", "25\xa0%", "100\xa0%"))
+    shown = {shape.name: shape.shown for shape in scene_page._bodies(seen)}
+    assert shown == {"skin": True, "mass0": True, "unseen": False}
 
 
 def test_a_b_scan_is_a_slice_where_it_was_taken(folder, scene):

@@ -17,6 +17,7 @@ from recon.navigation.browser_view import LOOPBACK, BrowserView
 from recon.navigation.mass_distances import MassDistance, bodies_of, distances
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import BodyAt, Latency, Moment, StillScene
+from recon.navigation.seen_so_far import SeenSoFar
 from recon.navigation.tool_distances import AtPlane, Crossing, TipFigures
 from tests.recon.navigation import headless_browser
 
@@ -136,6 +137,23 @@ def test_of_port_0_it_takes_a_free_one():
     finally:
         for view in views:
             view.close()
+
+
+def test_what_is_still_to_be_scanned_is_points_that_vanish():
+    """In metres, two colours; the next map takes their place, and no new map leaves them."""
+    some = SeenSoFar(0.5, 1000.0, np.array([[10, 20, 700], [13, 20, 700]], np.float32), np.array([0.1, 0.7], np.float32))
+    all_seen = SeenSoFar(1.0, 1000.0, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    view = BrowserView(StillScene(np.eye(4)), 0)
+    try:
+        for number in (1, 2):
+            view.publish(Moment(number, 0, None, "target not found", seen=some))
+            points = view._unseen
+            np.testing.assert_allclose(points.points.astype(float), some.points * 0.001, rtol=1e-3)
+            assert np.array_equal(points.colors, [browser_view.UNSEEN, browser_view.HALF_SEEN])
+        view.publish(Moment(3, 0, None, "target not found", seen=all_seen))
+        assert len(view._unseen.points) == 0
+    finally:
+        view.close()
 
 
 def test_it_listens_on_this_computer_alone():

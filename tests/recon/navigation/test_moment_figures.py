@@ -9,6 +9,7 @@ from recon.navigation.mass_distances import MassDistance
 from recon.navigation.moment_figures import html_of
 from recon.navigation.placed_scans import PlacedScan
 from recon.navigation.publishing import Latency, Moment
+from recon.navigation.seen_so_far import SeenSoFar
 
 POSE = rigid.transform(np.eye(3), [0, 0, 640])
 SCAN = PlacedScan(np.zeros((120, 80), np.uint8), 1, 10**9, np.eye(4))
@@ -36,6 +37,11 @@ def test_each_figure_stands_under_its_name():
         ["Latency", "31 ms, 99 % below 58 ms"],
         ["Poses", "25 a second"],
     ]
+
+
+def test_the_share_that_was_seen_stands_last():
+    seen = SeenSoFar(0.426, 212_400.0, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    assert rows(html_of(Moment(4, 0, POSE, "target predicted", seen=seen), ()))[-1] == ["Seen", "43 % of 212 cm³"]
 
 
 def test_without_a_b_scan_no_row_goes_away():

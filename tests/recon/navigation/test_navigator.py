@@ -15,6 +15,7 @@ from recon.navigation.feeds import Device
 from recon.navigation.mass_distances import bodies_of
 from recon.navigation.moving_bodies import MovingBodies
 from recon.navigation.navigator import Navigator
+from recon.navigation.seen_so_far import SeenSoFar
 from recon.tracking.pose_fit import lost
 from tests.recon import probe_motions
 from tests.recon.navigation.bodies_seen import NEEDLE, PROBE, three, unseen
@@ -250,3 +251,26 @@ def test_a_record_gets_every_moment_however_slow_it_is(navigate):
     numbers = [moment.number for moment in record.moments]
     assert numbers == list(range(1, numbers[-1] + 1)) and numbers[-1] >= kept.moments[-1].number
     assert record.closed and record.moments[-1].frame_ns is not None
+
+
+def test_b_scans_are_mapped_and_moments_hold_the_newest_map(navigate):
+    """Each that is placed, once; also of moments without frames or a pose."""
+
+    class Mapped(Kept):
+        newest = SeenSoFar(0.5, 1000.0, np.zeros((1, 3), np.float32), np.zeros(1, np.float32))
+
+        def start(self):
+            self.scans = []
+
+        def add(self, scan):
+            self.scans.append(scan)
+
+        stop = Kept.close
+
+    kept, mapper = Kept(), Mapped()
+    navigator = navigate([kept], mapper=mapper)
+    until(lambda: sum(moment.scan is not None for moment in kept.moments) >= 5)
+    navigator.stop()
+    numbers = [scan.number for scan in mapper.scans]
+    assert mapper.closed and len(numbers) >= 5 and len(set(numbers)) == len(numbers)
+    assert all(moment.seen is mapper.newest for moment in kept.moments)

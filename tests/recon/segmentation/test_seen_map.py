@@ -1,0 +1,84 @@
+"""The map of what was seen: its figures, its surface, its files, and how long it takes."""
+
+import numpy as np
+import pytest
+
+from recon.errors import InputError
+from recon.files import volumes
+from recon.freehand.scans import Scans
+from recon.geometry import rigid
+from recon.segmentation import insonation, seen_map
+from recon.segmentation.detectability import Sought
+from tests.recon.pose_stacks import SHAPE, stack, voxel
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    """Two pieces of a stroke, with a gap of 12 mm between them."""
+    places = np.concatenate([np.arange(-30, -6 + 0.01, 0.5), np.arange(6, 30.1, 0.5)])
+    return seen_map.look(insonation.of_sweep(stack(places), SHAPE))
+
+
+def test_a_mass_is_seen_within_the_pieces_and_not_in_the_gap(mapped):
+    places = {"within": [20, 20, 18], "gap": [20, 20, 0], "cut": [20, 20, 7]}
+    at = {name: voxel(mapped.where, place) for name, place in places.items()}
+    found = {name: mapped.probability[index] for name, index in at.items()}
+    assert found["within"] > seen_map.WELL and found["gap"] < 0.01 and found["cut"] < seen_map.POORLY
+    assert not mapped.unseen[at["within"]] and mapped.unseen[at["gap"]]
+    assert mapped.unseen[voxel(mapped.where, [45, 20, 18])], "beside the hull is still to be scanned"
+    assert not mapped.room[voxel(mapped.where, [20, 1, 18])], "where a ball would stand out of the skin none is"
+
+
+def test_figures_are_volumes_of_what_was_scanned(mapped):
+    """Of two boxes of 40 x 37 x 24 mm below the ringing, places 4 mm from their sides count, or nearly."""
+    figures = mapped.figures
+    box = (40 - 8) * (40 - 3 - 8) * (24 - 8)
+    assert figures["seen_mm3"] == pytest.approx(2 * box, rel=0.25)
+    whole = (mapped.room & mapped.where.hull).sum() * 8
+    assert figures["seen_mm3"] + figures["unseen_mm3"] == pytest.approx(whole, rel=0.15), "little lies between"
+    assert mapped.line.startswith("seen        ") and "8 mm and 8 dB" in mapped.line
+
+
+def test_the_table_rises_with_contrast(mapped):
+    """A row a size, a column a contrast; a sought contrast isn't that of the table."""
+    shares = np.array(mapped.table.shares)
+    assert shares.shape == (len(seen_map.SIZES_MM), len(seen_map.CONTRASTS_DB)) and (np.diff(shares, axis=1) > 0).all()
+    assert shares.min() >= 0 and shares.max() < 0.9, "sides and gap were not seen"
+
+
+def test_the_surface_is_closed_and_holds_what_is_unseen(mapped):
+    surface = seen_map.unseen_surface(mapped)
+    assert surface.is_watertight
+    assert surface.volume == pytest.approx(mapped.unseen.sum() * 8, rel=0.15)
+
+
+def test_uneven_tissue_hides_more(mapped):
+    uneven = seen_map.look(mapped.where, uneven_db=3.4)
+    assert (np.array(uneven.table.shares) <= np.array(mapped.table.shares)).all()
+    assert uneven.figures["seen_mm3"] < mapped.figures["seen_mm3"]
+    assert seen_map.look(mapped.where, Sought(20, 20), 3.4).figures["seen_mm3"] > 0
+
+
+def test_files_hold_the_map_where_it_is(mapped, tmp_path):
+    seen_map.write(tmp_path, mapped)
+    found = seen_map.read(tmp_path)
+    volume = volumes.read_volume(found.volume)
+    np.testing.assert_array_equal(volume.voxels, mapped.probability)
+    k, j, i = voxel(mapped.where, [20, 20, 18])
+    assert rigid.apply(volume.world_from_voxel, [float(i), float(j), float(k)]) == pytest.approx([20, 20, 18], abs=1.01)
+    assert found.table == mapped.table and found.unseen.volume == pytest.approx(seen_map.unseen_surface(mapped).volume, rel=1e-3)
+    assert seen_map.read(tmp_path / "other") is None
+    (tmp_path / seen_map.TABLE).write_text('{"size_mm": -1}')
+    with pytest.raises(InputError, match=r"seen\.json"):
+        seen_map.read(tmp_path)
+
+
+def test_a_sweep_without_a_pose_amid_others_has_the_map_of_the_others():
+    places = np.arange(-15, 15.1, 0.5)
+    matrices = stack(places)
+    matrices[[4, 31]] = np.nan
+    kept = np.isfinite(matrices).all(axis=(1, 2))
+    grey = np.full(SHAPE, 90, np.uint8)
+    sweeps = [Scans(SHAPE, some, lambda some=some: iter([grey] * len(some)), 1540, 1540) for some in (matrices, matrices[kept])]
+    with_lost, without = map(seen_map.of_scans, sweeps)
+    np.testing.assert_array_equal(with_lost.probability, without.probability)
