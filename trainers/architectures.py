@@ -175,7 +175,9 @@ class MassSegmenter(nn.Module):
 
     def forward(self, scan: Tensor) -> Tensor:
         """(n, 1, h, w) to logits of the same shape."""
-        levels = [self.down[0](scan)]
+        mean = scan.mean((2, 3), keepdim=True)  # scanners differ in gain and dynamic range
+        spread = ((scan - mean) ** 2).mean((2, 3), keepdim=True).sqrt()
+        levels = [self.down[0]((scan - mean) / (spread + 0.02))]
         for stage in self.down[1:]:
             levels.append(stage(max_pool2d(levels[-1], 2)))
         features = levels.pop()

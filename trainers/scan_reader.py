@@ -1,18 +1,26 @@
-"""Reads rendered sweeps, as of `sonotwin sweep`, for the network that finds masses: B-scans as it sees them, and their masses."""
+"""Reads B-scans with their masses, as the network that finds these sees them: rendered sweeps, or images with outlines.
 
-from collections.abc import Callable, Iterator, Sequence
+Outlines of others, such as of public breast images, come as a folder with `outlines.csv`: a row an image with the columns
+`image` and `mask`, files in the folder, of one size, the mask white within lesions; and `mm_per_px`, the size of a pixel.
+"""
+
+import csv
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from recon.capture.image_formats import decode_image
 from recon.capture.images import read_image
 from recon.capture.manifest import MANIFEST, image_name
 from recon.capture.sweep_part import read_sweep
-from recon.errors import InputError, validated
+from recon.errors import InputError, reason, short, validated
 from recon.files import json_text
+from recon.files.regular import read_bytes
 from recon.segmentation import mass_network
 
 Grey = NDArray[np.uint8]
@@ -20,6 +28,7 @@ Grey = NDArray[np.uint8]
 CAPTURE, SCENE, LABELS = "capture", Path("truth", "scene.json"), Path("truth", "sweep", "labels")
 MASS = "mass"  # how labels of masses begin; a complex cyst's solid part is one's, too
 SOLID = "solid"
+OUTLINES, COLUMNS = "outlines.csv", ("image", "mask", "mm_per_px")
 
 
 @dataclass(frozen=True)
@@ -42,16 +51,16 @@ class _Scene(BaseModel):
 
 
 def read_scans(folders: Sequence[Path], tell: Callable[[int], None] = lambda count: None) -> Scans:
-    """All B-scans of sweeps: each folder is that of one sweep, or of many.
+    """All B-scans of some folders: each is that of one sweep, of many, or of images with outlines, each a sample of its own.
 
     Raises
     ------
     InputError
-        If a folder has no sweep, or one that is damaged, or has no truth.
+        If a folder has neither sweeps nor outlines, or one that is damaged, or has no truth.
     """
     images, masks, sample = list[Grey](), list[Grey](), list[int]()
-    for number, sweep in enumerate(sweep for folder in folders for sweep in _sweeps(folder)):
-        for image, mask in _read(sweep):
+    for number, pairs in enumerate(pairs for folder in folders for pairs in _samples(folder)):
+        for image, mask in pairs:
             images.append(image)
             masks.append(mask)
             sample.append(number)
@@ -61,14 +70,52 @@ def read_scans(folders: Sequence[Path], tell: Callable[[int], None] = lambda cou
     return Scans(wide, inside, np.array(sample))
 
 
-def _sweeps(folder: Path) -> list[Path]:
-    """Folders of the sweeps in a folder."""
+def _samples(folder: Path) -> Iterator[Iterable[tuple[Grey, Grey]]]:
+    """B-scans and masks of each sweep, or of each image with an outline, in a folder."""
+    if (folder / OUTLINES).is_file():
+        return ([pair] for pair in _outlined(folder))
     if (folder / CAPTURE).is_dir():
-        return [folder]
+        return iter([_read(folder)])
     found = sorted(path.parent for path in folder.glob(f"*/{CAPTURE}") if (path / MANIFEST).is_file())
     if not found:
-        raise InputError(f"{folder}: expected sweeps, as of `sonotwin sweep count=100`, found none")
-    return found
+        raise InputError(f"{folder}: expected sweeps, as of `sonotwin sweep count=100`, or {OUTLINES}, found none")
+    return (_read(sweep) for sweep in found)
+
+
+def _outlined(folder: Path) -> Iterator[tuple[Grey, Grey]]:
+    """Images and masks of a table."""
+    path = folder / OUTLINES
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            rows = list(csv.DictReader(file))
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: expected a table, found {reason(error)}") from None
+    if not rows:
+        raise InputError(f"{path}: expected a row for each image, found none")
+    for number, row in enumerate(rows, start=2):
+        place = f"{path}: line {number}"
+        if missing := [name for name in COLUMNS if not row.get(name)]:
+            raise InputError(f"{place}: expected {', '.join(COLUMNS)}, found no {missing[0]}")
+        image, mask = (_grey(folder / row[name]) for name in COLUMNS[:2])
+        if image.shape != mask.shape:
+            sizes = " and ".join(f"{one.shape[1]}x{one.shape[0]}" for one in (image, mask))
+            raise InputError(f"{place}: expected image and mask of one size, found {sizes}")
+        try:
+            mm = float(row["mm_per_px"])
+        except ValueError:
+            mm = np.nan
+        if not 0.01 <= mm <= 1:
+            raise InputError(f"{place}: mm_per_px: expected 0.01 to 1, found {short(row['mm_per_px'])}")
+        inside = np.where(mask > 127, 255, 0).astype(np.uint8)
+        yield mass_network.reduced(image, (mm, mm)), mass_network.reduced(inside, (mm, mm))
+
+
+def _grey(path: Path) -> Grey:
+    """An image file of 8 bits as grey."""
+    pixels = decode_image(path, read_bytes(path))
+    if pixels.dtype != np.uint8:
+        raise InputError(f"{path}: expected 8 bits, found 16")
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
 
 
 def _read(folder: Path) -> Iterator[tuple[Grey, Grey]]:

@@ -30,8 +30,10 @@ Reason = Literal[
     "shadow of a mass",
     "at the scan's edge",
     "behind the tissue",
+    "unsure",
+    "looks like tissue",
 ]
-UNLIKELY: tuple[Reason, ...] = ("shadow of a mass", "at the scan's edge", "behind the tissue")
+UNLIKELY: tuple[Reason, ...] = ("shadow of a mass", "at the scan's edge", "behind the tissue", "looks like tissue")
 """reasons that are listed without a warning: what they are given to is hardly a mass"""
 
 

@@ -14,9 +14,13 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from recon import threads
+from recon.freehand.volume_compounding import Clip, Grid
+from recon.segmentation import echo_power
+from recon.segmentation.echo_power import EchoPower, Placed
 from recon.tracking import networks
 from recon.tracking.networks import Interface
 
+Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights" / "masses.onnx"
@@ -51,6 +55,24 @@ def reduced(image: NDArray[np.uint8], pixel_mm: tuple[float, float]) -> NDArray[
     wide, high = (max(round(count * mm / PIXEL_MM), 1) for count, mm in ((width, pixel_mm[0]), (height, pixel_mm[1])))
     small = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
     return np.pad(small, ((0, -high % MULTIPLE), (0, -wide % MULTIPLE)))
+
+
+def averaged(
+    images: Iterable[NDArray[np.uint8]],
+    world_from_pixel: Array,
+    grid: Grid,
+    clip: Clip,
+    network: onnxruntime.InferenceSession | None = None,
+) -> EchoPower:
+    """Mean probability of a mass on a grid, in place of power: `recon.segmentation.echo_power.averaged`."""
+    pixel_mm = echo_power.pixel_mm(world_from_pixel)
+
+    def place(chance: Map) -> Placed:
+        left, right, top, bottom = clip.bounds(chance.shape)
+        v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
+        return Placed(np.ascontiguousarray(chance[top : bottom + 1, left : right + 1]), np.ones_like(u), u, v)
+
+    return echo_power.accumulated(map(place, probabilities(images, pixel_mm, network)), world_from_pixel, grid)
 
 
 def probabilities(

@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 from recon import arguments, threads
 from recon.errors import InputError
-from recon.freehand.volume_compounding import Clip
+from recon.freehand.volume_compounding import Clip, grid_of
 from recon.geometry import rigid
-from recon.segmentation import blur_correction, border_fit, echo_power
+from recon.segmentation import blur_correction, border_fit, echo_power, mass_network
 from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.left_out import LeftOut, Reason
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
-from recon.segmentation.rough_bodies import FAINT, LIMITS, Found, faint, rough, say
+from recon.segmentation.rough_bodies import FAINT, LIMITS, LOOK, Found, Rough, faint, likely, rough, say
 from recon.segmentation.shadow_clearing import Recording, cleared, passed
 
 Array = NDArray[np.float64]
@@ -25,6 +25,10 @@ Mask = NDArray[np.bool_]
 
 SPACING_MM = (0.5, 0.25, 0.5)  # along the array, the beam and across; a border square to the beam is a line of its pulse
 REFINEMENTS = (2, 3)  # after each clearing
+LOOK_WAYS: dict[Reason, str] = {
+    "looks like tissue": "it looks like tissue, such as a lobule of fat",
+    "unsure": "it may be a mass, or tissue that looks like one",
+}
 
 
 def from_scans(
@@ -78,6 +82,8 @@ def from_scans(
     roughly = 1  # refinement of the surface, as exact as clearing needs it
     begun = rough(power)
     even = begun.uneven_db < FAINT.even_db
+    if begun.uneven_db >= LOOK.grown_db:
+        return _by_looks(recording, begun, power, sound)
     bright = faint(power, [], begun.hidden, signs=(1,)).masses if even else []
     masses, left_out = refined([*begun.masses, *bright], power, roughly), list[LeftOut]()
     for times in REFINEMENTS:
@@ -110,6 +116,29 @@ def from_scans(
     masses = [part for mass in masses for part in parted(mass, power.volume.directions)]
     say(left_out)
     return Found(sorted(masses, key=lambda mass: -mass.volume), begun.left_out + left_out, begun.uneven_db)
+
+
+def _by_looks(recording: Recording, begun: Rough, power: EchoPower, sound: Sound) -> Found:
+    """Masses in grown tissue, which is as uneven as they are: by their looks, with borders fitted to the power."""
+    grid = grid_of(power.volume)
+    chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip)
+    found = likely(chance, power, begun)
+    masses, left_out = found.masses, found.left_out
+    near_mm = 1.0  # of a mass's border: what a dark body has in common with it
+    taken = distances(masses, grid) if masses else None
+    for dark in begun.masses:
+        core = _core(dark)
+        shares = _sampled(chance, core)
+        if taken is not None and np.nanmin(_sampled(EchoPower(taken, power.weight), core), initial=np.inf) < near_mm:
+            continue
+        reason: Reason = "looks like tissue" if np.nanmean(shares) < LOOK.denied else "unsure"
+        left_out.append(_left_out(reason, dark, power, LOOK_WAYS[reason]))
+    for times in REFINEMENTS:
+        if masses:
+            power = cleared(recording, grid, masses, sound)
+            masses = refined(masses, power, times)
+    say(left_out)
+    return Found(sorted(masses, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
 
 
 def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:

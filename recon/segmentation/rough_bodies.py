@@ -105,7 +105,20 @@ class FaintLimits:
     behind_mm: float = 5.0  # of that
 
 
-LIMITS, CUT, GAP, FAINT = MassLimits(), CutBodyLimits(), GapLimits(), FaintLimits()
+@dataclass(frozen=True)
+class LookLimits:
+    """When voxels count as a mass by their looks, as of `recon.segmentation.mass_network`."""
+
+    grown_db: float = 2.8  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 3.4
+    smooth_mm: float = 1.0  # standard deviation; B-scans lie about as far apart
+    sure: float = 0.5  # probability
+    unsure: float = 0.2  # of bodies that are named
+    least_mm3: float = 30.0
+    told_mm3: float = 15.0  # of a body that isn't measured, that is named
+    denied: float = 0.1  # mean probability below which a dark body counts as the tissue's own
+
+
+LIMITS, CUT, GAP, FAINT, LOOK = MassLimits(), CutBodyLimits(), GapLimits(), FaintLimits(), LookLimits()
 CUT_WAYS: dict[Reason, str] = {
     "cut by a gap in the sweep": "scan there again",
     "cut by the images' lower end": "set a greater depth",
@@ -138,6 +151,7 @@ class Rough(NamedTuple):
     left_out: list[LeftOut]
     uneven_db: float  # standard deviation of the tissue's power; from FAINT.even_db on, no faint ones are told from it
     hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones
+    gap: Mask  # voxels that no B-scan shows, with B-scans on both sides
 
 
 def rough(power: EchoPower) -> Rough:
@@ -147,7 +161,7 @@ def rough(power: EchoPower) -> Rough:
     the beam, which may be shadows of borders, weak ones, and small ones where they are many.
     """
     spacing = power.volume.spacing[::-1]
-    gap, left_out = _gaps(power)
+    gap, left_out = gaps(power)
     ratio, seen = _over_tissue(power)
     dark = seen & (ratio < LIMITS.dark)
     uneven_db = _unevenness(ratio, seen & ~_widen(dark, FAINT.beside_mm, spacing))
@@ -187,7 +201,7 @@ def rough(power: EchoPower) -> Rough:
             masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
             kept.append(one)
     say(left_out)
-    return Rough(masses, left_out, uneven_db, shadowed | (dark & ~_mask(kept, dark.shape)))
+    return Rough(masses, left_out, uneven_db, shadowed | (dark & ~_mask(kept, dark.shape)), gap)
 
 
 def say(left_out: Sequence[LeftOut]) -> None:
@@ -241,6 +255,65 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[i
             else:
                 found.append(Mass(meshed(field, -abs(one.core) / 2, one.part, volume, outside=0.0), bright=sign > 0))
     return Found(found, left_out)
+
+
+def likely(chance: EchoPower, power: EchoPower, begun: Rough) -> Found:
+    """Bodies that look like masses, in tissue as uneven as these; what is left out isn't logged.
+
+    Parameters
+    ----------
+    chance : mean probability of a mass, in place of power
+    begun : of a search for dark bodies, which are tissue where they don't look like masses
+    """
+    spacing, volume = chance.volume.spacing[::-1], chance.volume
+    smooth = _smooth(volume.voxels, chance.weight, LOOK.smooth_mm / spacing)
+    seen = np.isfinite(smooth) & ~_wide_gaps(chance)  # which the smoothing would bridge
+    smooth = np.where(seen, smooth, 0).astype(np.float32)
+    bodies, edge = _bodies(smooth > LOOK.sure, smooth, seen, spacing)
+    found, left_out = list[Mass](), [one for one in begun.left_out if one.reason == "gap"]
+    for one in bodies:
+        if one.volume < LOOK.least_mm3:
+            left_out += [_leave_out("small", one, power)] if one.volume >= LOOK.told_mm3 else []
+            continue
+        field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), 1 - smooth[one.part], 1.0)
+        mesh = meshed(field, 1 - LOOK.sure, one.part, volume)
+        found.append(Mass(mesh, bright=_level(one, power) > 1))
+    for one in edge:
+        if one.volume >= LOOK.told_mm3:
+            left_out.append(_leave_out(_cut_by(one, seen, begun.gap, spacing), one, power))
+    taken = _mask([*bodies, *edge], smooth.shape)
+    doubtful, open_ = _bodies(smooth > LOOK.unsure, smooth, seen, spacing, taken=taken)
+    left_out += [_leave_out("unsure", one, power) for one in (*doubtful, *open_) if one.volume >= LOOK.told_mm3]
+    return Found(found, left_out, begun.uneven_db)
+
+
+def _wide_gaps(power: EchoPower) -> Mask:
+    """Voxels in gaps of the scan that cut masses in two."""
+    spacing, wide = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool)
+    for axis in (0, 2):
+        width = _gap_widths(power.seen, axis, float(spacing[axis]))
+        wide |= np.isfinite(width) & (width >= GAP.widths_mm[0])
+    return wide
+
+
+def _level(one: Candidate, power: EchoPower) -> float:
+    """Mean power in a body over that around it."""
+    spacing = power.volume.spacing[::-1]
+    around = _widen(np.pad(one.inside, 0), 2 * LIMITS.grow_mm, spacing) & ~_widen(one.inside, LIMITS.edge_mm, spacing)
+    values, weight = power.volume.voxels[one.part], power.weight[one.part]
+    within, beside = (float((values * weight)[where].sum() / max(weight[where].sum(), 1e-6)) for where in (one.inside, around))
+    return within / max(beside, 1e-6)
+
+
+def _cut_by(one: Candidate, seen: Mask, gap: Mask, spacing: Array) -> Reason:
+    """By what a body is cut whose border wasn't seen as a whole."""
+    margin = np.ceil(2 * LIMITS.edge_mm / spacing).astype(int)
+    pairs = [(m, m) for m in margin]
+    inside = np.pad(one.inside, pairs)
+    known, within = (np.pad(field, pairs) for field in (seen, gap))
+    part = tuple(slice(s.start, s.start + n) for s, n in zip(one.part, inside.shape, strict=True))
+    sides = cut_sides(_widen(inside, 2 * LIMITS.edge_mm, spacing) & ~inside & ~known[part], within[part])
+    return max(sides, key=lambda name: sides[name])
 
 
 def _counts(one: Candidate) -> bool:
@@ -352,6 +425,14 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
             text = f"a body of {place} is left out: no tissue is seen behind it, so it may be what the tissue lies on"
         case "at the scan's edge":
             text = f"a body of {place} is left out: it reaches the scan's edge; scan on there if it may be a mass"
+        case "unsure":
+            text = f"a body of {place} may be a mass, or tissue that looks like one; it isn't measured"
+        case "looks like tissue":
+            text = f"a dark body of {place} is left out: it looks like tissue, such as a lobule of fat"
+        case reason if reason.startswith("cut by"):
+            along, deep, across = extents
+            text = f"a body is {reason}, and is left out: {place}, {along:.0f} x {deep:.0f} x {across:.0f} mm; "
+            text += CUT_WAYS.get(reason, "scan on there")
         case _:
             text = f"a dark body of {place} is left out: it is too small to be measured, or told from a shadow or uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text)
@@ -374,7 +455,7 @@ def _nearest(mask: Mask, spacing: Array) -> tuple[NDArray[np.intp], ...]:
     return tuple(np.asarray(ndimage.distance_transform_edt(~mask, spacing, return_distances=False, return_indices=True)))
 
 
-def _gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
+def gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
     """Voxels that no B-scan shows, with B-scans on both sides, where masses are missed; and the largest of these gaps."""
     spacing, gaps, found = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool), list[LeftOut]()
     tall = np.ones((1, int(np.ceil(GAP.height_mm / spacing[1])), 1), bool)
@@ -439,12 +520,7 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         before = np.logical_or.accumulate(inside[:, ::-1], axis=1)[:, ::-1] & ~behind
         beside, before = shell & ~behind & ~before, shell & before & inside.any(axis=1, keepdims=True)
         unseen, front = shell & ~here, before & here
-        sides: dict[Reason, int] = {
-            "cut by the images' side": _fullest(unseen, 2),
-            "cut by the sweep's end": _fullest(unseen & ~gap[part], 0),
-            "cut by a gap in the sweep": _fullest(unseen & gap[part], 0),
-            "cut by the images' lower end": _fullest(unseen, 1),
-        }
+        sides: dict[Reason, int] = cut_sides(unseen, gap[part])
         covered, told = front.sum() > CUT.before * before.sum(), (beside & here).sum()
         among = told > CUT.mostly * beside.sum() and (beside & bright[part]).sum() > CUT.around * told  # tissue
         among = among and _thickness(inside, spacing) > CUT.thick * min(along, across)
@@ -472,6 +548,16 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
         shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
     return left_out, shadowed[pad:-pad, pad:-pad, pad:-pad]
+
+
+def cut_sides(unseen: Mask, gap: Mask) -> dict[Reason, int]:
+    """By what a body is cut, with the number of voxels there, from those of its shell that weren't seen : (nz, ny, nx)."""
+    return {
+        "cut by the images' side": _fullest(unseen, 2),
+        "cut by the sweep's end": _fullest(unseen & ~gap, 0),
+        "cut by a gap in the sweep": _fullest(unseen & gap, 0),
+        "cut by the images' lower end": _fullest(unseen, 1),
+    }
 
 
 def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:

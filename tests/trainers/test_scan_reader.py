@@ -9,7 +9,6 @@ import pytest
 from recon.errors import InputError
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
-from recon.segmentation import mass_network
 from tests.recon.captures import write_sweep
 from trainers.scan_reader import read_scans
 from trainers.shard_reader import chosen, split
@@ -68,7 +67,10 @@ def test_the_last_sweeps_validate(sweeps):
     [
         (lambda one: (one / "truth" / "scene.json").unlink(), r"scene.json: "),
         (lambda one: (one / "truth" / "scene.json").write_text("{}"), r"scene.json: labels: "),
-        (lambda one: (one / "truth" / "sweep" / "labels" / "0001.png").write_bytes(b""), r"labels/0001.png: expected .* an empty file"),
+        (
+            lambda one: (one / "truth" / "sweep" / "labels" / "0001.png").write_bytes(b""),
+            r"labels/0001.png: expected .* an empty file",
+        ),
     ],
 )
 def test_damage_is_one_line(sweeps, damage, message):
@@ -78,15 +80,36 @@ def test_damage_is_one_line(sweeps, damage, message):
 
 
 def test_a_folder_without_sweeps_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"expected sweeps, as of `sonotwin sweep count=100`, found none$"):
+    with pytest.raises(InputError, match=r"expected sweeps, as of `sonotwin sweep count=100`, or outlines.csv, found none$"):
         read_scans([tmp_path])
 
 
-def test_what_is_made_smaller_comes_back_in_place():
-    """A pixel p of the network's image shows what lies about s (p + 1/2) - 1/2 for a scale s."""
-    image = np.zeros((400, 300), np.uint8)
-    image[200:240, 90:120] = 255  # centre (104.5, 219.5)
-    small = mass_network.reduced(image, (0.13, 0.11)).astype(float)
-    assert small.shape == (112, 112)
-    v, u = (np.average(axis, weights=small) for axis in np.indices(small.shape))
-    assert abs((u + 0.5) * 300 / 98 - 0.5 - 104.5) < 0.05 and abs((v + 0.5) * 400 / 110 - 0.5 - 219.5) < 0.05
+def outline(folder, mm="0.2", size=(80, 60)):
+    """An image of noise, in colour, with a square of 6 mm, and its table."""
+    folder.mkdir()
+    mask = np.zeros(size[::-1], np.uint8)
+    mask[10:40, 20:50] = 255
+    cv2.imwrite(str(folder / "a.png"), np.random.default_rng(0).integers(1, 255, (60, 80, 3)).astype(np.uint8))
+    cv2.imwrite(str(folder / "a_mask.png"), mask)
+    (folder / "outlines.csv").write_text(f"image,mask,mm_per_px,kind\na.png,a_mask.png,{mm},benign\n", encoding="utf-8")
+    return folder
+
+
+def test_outlines_of_others_are_samples(sweeps, tmp_path):
+    """Each image one; after sweeps."""
+    scans = read_scans([sweeps[0], outline(tmp_path / "theirs")])
+    assert scans.sample.tolist() == [0] * 3 + [1] * 3 + [2]
+    assert (scans.masks[-1] > 127).sum() == 15**2 and scans.images.shape[1:] == (64, 48)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"mm": "4"}, r"outlines.csv: line 2: mm_per_px: expected 0.01 to 1, found 4$"),
+        ({"mm": ""}, r"outlines.csv: line 2: expected image, mask, mm_per_px, found no mm_per_px$"),
+        ({"size": (81, 60)}, r"outlines.csv: line 2: expected image and mask of one size, found 80x60 and 81x60$"),
+    ],
+)
+def test_a_wrong_table_is_one_line(tmp_path, more, message):
+    with pytest.raises(InputError, match=message):
+        read_scans([outline(tmp_path / "theirs", **more)])

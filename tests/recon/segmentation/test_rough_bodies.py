@@ -147,3 +147,51 @@ def test_a_bright_body_at_the_scans_end_is_listed(rng):
     power = speckled(tissue(5.0, 4.0)[:last], rng)
     found = rough_bodies.faint(power, [], rough_bodies.rough(power).hidden)
     assert not found.masses and [one.reason for one in found.left_out] == ["at the scan's edge"]
+
+
+def begun(gap=None) -> rough_bodies.Rough:
+    """A search that found nothing."""
+    none = np.zeros(PLACES.shape[:3], bool)
+    return rough_bodies.Rough([], [], 4.0, none, none if gap is None else gap)
+
+
+def looks(*balls) -> EchoPower:
+    """Mean probabilities of masses: balls (radius, probability, centre)."""
+    chance = np.zeros(PLACES.shape[:3])
+    for radius, share, centre in balls:
+        chance = np.maximum(chance, share * (away(radius, centre) < 0))
+    return EchoPower(Volume(chance.astype(np.float32), ORIGIN, SPACING), np.full(chance.shape, LOOKS, np.float32))
+
+
+def test_bodies_that_look_like_masses_are_found_with_their_brightness(rng):
+    """A smoothing by s moves a ball's border of radius r by s^2 / r inwards, and half of it lies 0.07 s within 0.95's half."""
+    for level in (0.2, 4.0):
+        (mass,) = rough_bodies.likely(looks((5.0, 0.95, CENTRE)), speckled(tissue(5.0, level), rng), begun()).masses
+        assert mass.bright == (level > 1) and np.linalg.norm(mass.centre - CENTRE) < 0.1
+        assert mass.volume == pytest.approx(volume_of(5.0 - 0.2 - 0.07), rel=0.04)
+
+
+def test_bodies_that_may_be_masses_are_named(rng):
+    """Unsure ones, small ones, and those that a side, an end, a gap or the images' lower end cuts, each as what it is."""
+    power = speckled(np.ones(PLACES.shape[:3]), rng)
+    low, high = ORIGIN, ORIGIN + SPACING * SIZE
+    cases = {
+        "unsure": (5.0, 0.4, CENTRE),
+        "small": (2.2, 0.95, CENTRE),
+        "cut by the images' side": (4.0, 0.9, [low[0], *CENTRE[1:]]),
+        "cut by the sweep's end": (4.0, 0.9, [*CENTRE[:2], high[2]]),
+        "cut by the images' lower end": (4.0, 0.9, [CENTRE[0], high[1], CENTRE[2]]),
+    }
+    for reason, ball in cases.items():
+        found = rough_bodies.likely(looks(ball), power, begun())
+        assert [one.reason for one in found.left_out] == [reason] and not found.masses
+        assert np.linalg.norm(np.array(found.left_out[0].centre_mm) - ball[2]) < 3
+
+
+def test_a_body_in_a_gap_is_cut_by_it(rng):
+    """Seen on both sides of 5 mm that no B-scan shows."""
+    chance, power = looks((5.0, 0.9, CENTRE)), speckled(np.ones(PLACES.shape[:3]), rng)
+    gap = np.abs(PLACES[..., 2] - CENTRE[2]) < 2.5
+    chance.weight[gap], chance.volume.voxels[gap] = 0, 0
+    found = rough_bodies.likely(chance, power, begun(gap))
+    assert {one.reason for one in found.left_out} == {"cut by a gap in the sweep"} and not found.masses
