@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from socket import gethostname
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 from pydantic import Field, field_validator, model_validator
@@ -47,6 +47,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "breast": "twin.experiments.breast_trial",
     "patient": "twin.experiments.patient_trial",
     "masses": "twin.experiments.mass_trial",
+    "seen": "twin.experiments.seen_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
@@ -70,6 +71,12 @@ class Film(Part):
     _power_of_two = field_validator("rays")(power_of_two)
 
 
+class SeenTissue(Part):
+    """Breasts with masses that may be found or not."""
+
+    tissue: Literal["silicone", "patients"] = "silicone"
+
+
 class Settings(Part):
     """All that experiments are made from; as in `conf/study.yaml`."""
 
@@ -88,6 +95,7 @@ class Settings(Part):
     wire_path: WirePath = WirePath(count=45, roll_deg=ROLL_DEG)
     ultrasound: Transducer = Transducer()
     masses: MassCondition = MassCondition()
+    seen: SeenTissue = SeenTissue()
     ranges: DataRanges
 
     @model_validator(mode="after")

@@ -89,7 +89,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
 
 
 def plan(condition: Condition, settings: Settings, seed: int) -> PlannedSweep:
-    """The sweep under a condition, with the covariance of its poses."""
+    """The sweep under a condition."""
     scanner = settings.ultrasound.model_dump()
     scanner |= {name: scanner[name] + more for name, more in condition.ultrasound.items()}
     chosen = SweepSettings(
@@ -99,10 +99,14 @@ def plan(condition: Condition, settings: Settings, seed: int) -> PlannedSweep:
         path=PATH.model_copy(update={"standoff_mm": condition.standoff_mm}),
         living=condition.living,
         clocks=CLOCKS,
-        pose_noise=NOISE,
         seed=seed,
     )
-    planned = plan_sweep(chosen)
+    return tracked(chosen)
+
+
+def tracked(settings: SweepSettings) -> PlannedSweep:
+    """A sweep with poses of the noise of `NOISE`, and with their covariance."""
+    planned = plan_sweep(settings.model_copy(update={"pose_noise": NOISE}))
     noise = np.diag(np.repeat([np.deg2rad(NOISE.turn_deg), NOISE.shift_mm], 3) ** 2)
     track = replace(planned.plan.track, covariance=np.tile(noise, (len(planned.plan.track.times), 1, 1)))
     return replace(planned, plan=replace(planned.plan, track=track))
@@ -152,13 +156,13 @@ def kept_scans(condition: Condition, planned: PlannedSweep, hidden: Sequence[Thi
     return kept
 
 
-def recorded(planned: PlannedSweep, folder: Path) -> Scans:
-    """The sweep as the software reads it, by a probe that is calibrated without errors."""
+def recorded(planned: PlannedSweep, folder: Path, tissue_m_s: float = TISSUE_M_S) -> Scans:
+    """The sweep as the software reads it, told lag and speed of sound, by a probe that is calibrated without errors."""
     chosen, probe = planned.settings, sweep_session.calibration_of(planned.settings.rig, planned.settings.ultrasound)
     session = Session(folder, "sweep", chosen.model_dump(mode="json"))
     taken = (planned.scene, planned.scanned, chosen.ultrasound, planned.plan, planned.scans(), probe)
     sweep_session.write_session(session, *taken)
-    fields = {"capture": folder / CAPTURE, "lag_s": CLOCKS.lag_s, "tissue_m_s": TISSUE_M_S, "tissue_sigma_m_s": 0.0}
+    fields = {"capture": folder / CAPTURE, "lag_s": chosen.clocks.lag_s, "tissue_m_s": tissue_m_s, "tissue_sigma_m_s": 0.0}
     scans = masses_step.read(masses_step.Settings(**fields))
     exact = Uncertainty(NAMES, np.zeros((len(NAMES), len(NAMES))))
     return replace(scans, probe=None if scans.probe is None else replace(scans.probe, uncertainty=exact))

@@ -1,0 +1,82 @@
+"""Coefficients are fitted to even seeds and tested on odd ones, by made-up pairs of known chances."""
+
+from dataclasses import astuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from recon.errors import InputError
+from recon.segmentation import detectability
+from recon.segmentation.detectability import ASSUMED, Calibration, Features
+from twin.experiments import seen_calibration
+
+TRUE = Calibration(-7.0, 2.5, 1.2, -30.0, -1.5)
+
+
+def table(rng, even=TRUE, odd=TRUE, tissue="silicone", trials=160, pairs=24):
+    """Trials of masses that differ in all features, found by the chances of one calibration in even seeds and another in odd."""
+    rows = []
+    for seed in range(trials):
+        unseen = np.maximum(rng.normal(0, 0.08, pairs), 0)
+        given = Features(rng.normal(2, 1, pairs), rng.normal(1.5, 0.5, pairs), unseen, (rng.random(pairs) < 0.3).astype(float))
+        found = rng.random(pairs) < detectability.probability(given, odd if seed % 2 else even)
+        columns = given._asdict() | {"found": found}
+        row = {f"pair{n:02d}_{name}": float(values[n]) for n in range(pairs) for name, values in columns.items()}
+        rows.append({"seen.tissue": tissue, "seed": seed, "pairs": float(pairs), **row, "error": None})
+    return rows
+
+
+def test_even_seeds_fit_whatever_odd_ones_say(rng):
+    """Each coefficient within four of its standard errors, by the information of the pairs; odd seeds have others."""
+    rows = table(rng, odd=Calibration(3.0, 0.1, 0.1, -1.0, 2.0))
+    fitting, testing = seen_calibration.halves(seen_calibration.outcomes([rows]))
+    assert set(fitting.seed % 2) == {0} and set(testing.seed % 2) == {1} and fitting.found.size == testing.found.size == 80 * 24
+    share = detectability.probability(fitting.features, TRUE)
+    design = np.column_stack([np.ones(len(share)), *fitting.features])
+    sigma = np.sqrt(np.diag(np.linalg.inv((design * (share * (1 - share))[:, None]).T @ design)))
+    found = seen_calibration.calibrate([rows])
+    assert (np.abs(np.subtract(astuple(found), astuple(TRUE))) < 4 * sigma).all()
+
+
+def test_pairs_that_a_trial_does_not_have_count_as_none(rng):
+    """A table has the columns of the trial with most pairs; others have NaN there, and those that failed everywhere."""
+    rows = table(rng, trials=4, pairs=3)
+    rows[1] |= {name: float("nan") for name in rows[1] if name.startswith("pair02")}
+    rows[2] |= {name: float("nan") for name in rows[2] if name.startswith("pair")}
+    found = seen_calibration.outcomes([rows, table(rng, tissue="patients", trials=1, pairs=2)])
+    assert found.seed.tolist() == [0, 0, 0, 1, 1, 3, 3, 3, 0, 0]
+    assert found.tissue.tolist() == ["silicone"] * 8 + ["patients"] * 2
+    assert found.features.resolved[4] == rows[1]["pair01_resolved"] and found.found[4] == rows[1]["pair01_found"]
+    with pytest.raises(InputError, match="pairs of a mass and a way, found none"):
+        seen_calibration.outcomes([[rows[2]]])
+
+
+def test_shares_have_the_interval_of_clopper_and_pearson():
+    """9 of 10 found: 0.555 to 0.997, as tabulated; a chance of 1 lies in the last range, and empty ranges have no line."""
+    chance, found = np.array([0.92] * 9 + [1.0, 0.2]), np.array([True] * 9 + [False, False])
+    lines = list(seen_calibration.shares(chance, found, seen_calibration.BINS))
+    assert lines == [
+        "0.20-0.30   0.20 predicted, 0.00 found (0.00 to 0.97) of 1",
+        "0.90-1.00   0.93 predicted, 0.90 found (0.55 to 1.00) of 10",
+    ]
+
+
+def test_the_report_tests_each_tissue_by_odd_seeds(rng, tmp_path):
+    """As read from studies' folders; fitted coefficients are better than assumed ones where these are wrong."""
+    for tissue, trials in (("silicone", 80), ("patients", 40)):
+        (tmp_path / tissue).mkdir()
+        rows = table(rng, tissue=tissue, trials=trials)
+        pq.write_table(pa.Table.from_pylist(rows), tmp_path / tissue / seen_calibration.TABLE)
+    tables = [seen_calibration.read(tmp_path / name) for name in ("silicone", "patients")]
+    lines = list(seen_calibration.report(tables))
+    tested = [line for line in lines if line.startswith("tested")]
+    assert [line.split()[1:3] for line in tested] == [["all:", "1440"], ["patients:", "480"], ["silicone:", "960"]]
+    assert all(float(line.split()[-1]) > float(line.split("score ")[1].split(",")[0]) for line in tested)
+    assert sum(line.startswith("bar  ") for line in lines) == 6
+    assert f"assumed {ASSUMED.unseen:g}" in lines[4]
+    with pytest.raises(InputError, match="expected some of odd seeds"):
+        list(seen_calibration.report([[row for row in tables[0] if row["seed"] % 2 == 0]]))
+    with pytest.raises(InputError, match=r"expected the folder of a study with table\.parquet"):
+        seen_calibration.read(tmp_path)
