@@ -5,7 +5,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from trainers.architectures import Detector, Segmenter, network
+from trainers.architectures import Detector, MassSegmenter, Segmenter, network
 
 
 def double(prefix, inputs, middle, outputs):
@@ -88,3 +88,15 @@ def test_our_segmenter_sees_a_whole_disc_from_its_middle():
     """A disc is 90 px wide, and up to 1.3 times that near the camera."""
     torch.manual_seed(0)
     assert reach(Segmenter(), 240, 120) >= 45
+
+
+def test_the_network_of_masses_sees_a_whole_scan():
+    """Of 40 x 50 mm from its middle; whatever the image's size, gain and offset."""
+    torch.manual_seed(0)
+    module = MassSegmenter().eval()
+    assert reach(module, 192, 96) >= 62
+    scan = torch.rand(2, 1, 128, 112)
+    with torch.no_grad():
+        answer = module(scan)
+        assert answer.shape == scan.shape
+        assert (module(0.5 * scan + 0.1) - answer).std() < 0.15 * answer.std()

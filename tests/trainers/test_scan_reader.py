@@ -1,4 +1,5 @@
-"""Sweeps become B-scans as the network of masses sees them, with their masses."""
+"""Sweeps become B-scans as the network of masses sees them, with their masses; batches and figures of these."""
+# ruff: noqa: E402 - torch is asked for before what needs it
 
 import json
 
@@ -6,11 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
+torch = pytest.importorskip("torch")
+
 from recon.errors import InputError
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
 from tests.recon.captures import write_sweep
-from trainers.scan_reader import read_scans
+from trainers.batches import SCAN, Batches, generator_of, scans
+from trainers.network_metrics import measure_masses
+from trainers.scan_reader import Scans, read_scans
 from trainers.shard_reader import chosen, split
 
 NAMES = ["surroundings", "breast", "mass0", "solid0", "massive"]
@@ -113,3 +118,72 @@ def test_outlines_of_others_are_samples(sweeps, tmp_path):
 def test_a_wrong_table_is_one_line(tmp_path, more, message):
     with pytest.raises(InputError, match=message):
         read_scans([outline(tmp_path / "theirs", **more)])
+
+
+def drawn(count=12):
+    """B-scans of grey 60, some with a white mass of 12 px radius in them."""
+    images, masks = np.full((count, 128, 112), 60, np.uint8), np.zeros((count, 128, 112), np.uint8)
+    for k in range(0, count, 3):
+        cv2.circle(masks[k], (40 + 3 * k, 50 + 2 * k), 12, 255, -1)
+        images[k][masks[k] > 0] = 180
+    return Scans(images, masks, np.arange(count))
+
+
+def test_masks_of_a_batch_are_where_its_masses_are():
+    """Mirrored, turned, scaled and shifted alike; more than half of the B-scans show one; black beside the image isn't known."""
+    batch = scans(drawn(), 64, generator_of(0, 5))
+    assert batch.images.shape == (64, 1, SCAN[1], SCAN[0]) and batch.images.max() <= 1
+    shows = batch.masks.amax((1, 2, 3)) > 0.9
+    assert 0.5 < shows.float().mean() < 0.95
+    for image, mask, known in zip(batch.images[shows], batch.masks[shows], batch.weights[shows], strict=True):
+        ground = (mask < 0.01) & (known > 0)
+        assert image[mask > 0.99].median() > image[ground].median()  # also where a grey map makes both alike
+    assert (batch.images[(batch.weights == 0) & (batch.masks == 0)] < 0.3).float().mean() > 0.95
+
+
+def test_a_batch_is_that_of_its_seed_and_step():
+    first, again, other = (Batches(drawn(), 4, 160, 0)[k] for k in (3, 3, 4))
+    assert all(torch.equal(one, two) for one, two in zip(first, again, strict=True))
+    assert not torch.equal(first[0], other[0])
+
+
+class Knowing(torch.nn.Module):
+    """Answers that were given to it, one a B-scan."""
+
+    def __init__(self, masks):
+        super().__init__()
+        self.answers, self.at = torch.from_numpy(masks)[:, None].float() - 127, 0
+
+    def forward(self, images):
+        self.at += len(images)
+        return self.answers[self.at - len(images) : self.at]
+
+
+def test_figures_of_masses():
+    """A perfect answer is perfect; one that misses one of four masses, and sees one in one of eight empty scans, says so."""
+    some = drawn()
+    perfect = measure_masses(Knowing(some.masks), some)
+    assert (perfect["iou"], perfect["missed"], perfect["empty_right"], perfect["false_px"]) == (1, 0, 1, 0)
+    wrong = some.masks.copy()
+    wrong[0], wrong[1] = 0, some.masks[0]
+    figures = measure_masses(Knowing(wrong), some)
+    assert (figures["iou"], figures["missed"], figures["empty_right"]) == (0.75, 0.25, 0.875)
+    assert figures["false_px"] == pytest.approx((some.masks[0] > 0).sum() / 8)
+    assert figures["iou_pixels"] == pytest.approx(3 / 5, abs=0.01)
+
+
+def test_the_verb_trains_on_sweeps(sweeps, tmp_path, capsys):
+    """A few steps, and on; the network is one that `segment` takes."""
+    from recon.segmentation import mass_network
+    from sonotwin.cli import main
+
+    many, single = sweeps
+    command = ["train", "network=masses", f"data=[{many}]", f"validation_data={single}", f"out={tmp_path / 'out'}", "threads=1"]
+    assert main([*command, "batch=2", "steps=2"]) == 0
+    said = capsys.readouterr().out
+    assert "6 B-scans to train with, 3 to validate with" in said and "of B-scans with a mass missed" in said
+    assert main([*command, "batch=2", "steps=3"]) == 0 and "from step 2 on" in capsys.readouterr().out
+    answers = mass_network.probabilities(
+        [np.full((60, 80), 90, np.uint8)], (0.4, 0.4), mass_network.opened(tmp_path / "out" / "masses.onnx")
+    )
+    assert next(answers).shape == (60, 80)
