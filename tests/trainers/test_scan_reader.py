@@ -169,7 +169,7 @@ def test_figures_of_masses():
     figures = measure_masses(Knowing(wrong), some)
     assert (figures["iou"], figures["missed"], figures["empty_right"]) == (0.75, 0.25, 0.875)
     assert figures["false_px"] == pytest.approx((some.masks[0] > 0).sum() / 8)
-    assert figures["iou_pixels"] == pytest.approx(3 / 5, abs=0.01)
+    assert figures["iou_pixels"] == pytest.approx(3 / 4, abs=0.001)
 
 
 def test_the_verb_trains_on_sweeps(sweeps, tmp_path, capsys):
