@@ -5,8 +5,10 @@ was trained on the twin's patients alone, see docs/training.md.
 """
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -25,8 +27,21 @@ Map = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights" / "masses.onnx"
 PIXEL_MM = 0.4  # of what the network sees: masses from 6 mm on are 15 px and more, and speckle is averaged
+GROWN_DB = 2.8  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 3.4 and more
 MULTIPLE = 16  # px, of its heights and widths
 INTERFACE: Interface = ({"scan": (None, 1, None, None)}, {"mask": (None, 1, None, None)})
+
+
+@dataclass(frozen=True)
+class Looks:
+    """When masses are told from tissue by their looks, and by which network."""
+
+    when: Literal["auto", "always", "never"] = "auto"  # auto: in tissue that is as uneven as a breast
+    network: onnxruntime.InferenceSession | None = None  # the one that comes with the software
+
+    def sees(self, uneven_db: float) -> bool:
+        """Whether they count, in tissue whose power has a standard deviation."""
+        return self.when == "always" or (self.when == "auto" and uneven_db >= GROWN_DB)
 
 
 def opened(path: Path = WEIGHTS) -> onnxruntime.InferenceSession:

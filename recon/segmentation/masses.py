@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+import onnxruntime
 from numpy.typing import NDArray
 
 from recon import arguments, threads
@@ -15,6 +16,7 @@ from recon.segmentation import blur_correction, border_fit, echo_power, mass_net
 from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.left_out import LeftOut, Reason
+from recon.segmentation.mass_network import Looks
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
 from recon.segmentation.rough_bodies import FAINT, LIMITS, LOOK, Found, Rough, faint, likely, rough, say
@@ -39,6 +41,7 @@ def from_scans(
     dynamic_range_db: float = 60.0,
     grey: float | None = None,
     blur: Blur | None = None,
+    looks: Looks | None = None,
 ) -> Found:
     """Find masses in B-scans, largest first, and what is left out.
 
@@ -54,6 +57,7 @@ def from_scans(
     blur : of the B-scans
         Lobes of masses are corrected for it, and for what the fit does to them; edges of shadows are as wide as the beam. Without
         it neither is done.
+    looks : whether, and by which network, masses are told from grown tissue
 
     Raises
     ------
@@ -65,6 +69,7 @@ def from_scans(
         raise InputError(f"images: expected {expected}, found {arguments.described(images)}")
     arguments.of_kind("sound", sound, Sound, type(None))
     arguments.of_kind("blur", blur, Blur, type(None))
+    arguments.of_kind("looks", looks, Looks, type(None))
     height, width = arguments.image_size("shape", shape, "height and width")
     shape = height, width
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
@@ -82,8 +87,9 @@ def from_scans(
     roughly = 1  # refinement of the surface, as exact as clearing needs it
     begun = rough(power)
     even = begun.uneven_db < FAINT.even_db
-    if begun.uneven_db >= LOOK.grown_db:
-        return _by_looks(recording, begun, power, sound)
+    looks = looks or Looks()
+    if looks.sees(begun.uneven_db):
+        return _by_looks(recording, begun, power, sound, looks.network)
     bright = faint(power, [], begun.hidden, signs=(1,)).masses if even else []
     masses, left_out = refined([*begun.masses, *bright], power, roughly), list[LeftOut]()
     for times in REFINEMENTS:
@@ -118,10 +124,12 @@ def from_scans(
     return Found(sorted(masses, key=lambda mass: -mass.volume), begun.left_out + left_out, begun.uneven_db)
 
 
-def _by_looks(recording: Recording, begun: Rough, power: EchoPower, sound: Sound) -> Found:
+def _by_looks(
+    recording: Recording, begun: Rough, power: EchoPower, sound: Sound, network: onnxruntime.InferenceSession | None
+) -> Found:
     """Masses in grown tissue, which is as uneven as they are: by their looks, with borders fitted to the power."""
     grid = grid_of(power.volume)
-    chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip)
+    chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip, network)
     found = likely(chance, power, begun)
     masses, left_out = found.masses, found.left_out
     near_mm = 1.0  # of a mass's border: what a dark body has in common with it

@@ -109,7 +109,6 @@ class FaintLimits:
 class LookLimits:
     """When voxels count as a mass by their looks, as of `recon.segmentation.mass_network`."""
 
-    grown_db: float = 2.8  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 3.4
     smooth_mm: float = 1.0  # standard deviation; B-scans lie about as far apart
     sure: float = 0.5  # probability
     unsure: float = 0.2  # of bodies that are named

@@ -18,6 +18,7 @@ from recon.segmentation import contact, mass_uncertainty, masses, rest, rough_bo
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.containment import Containment, contain
 from recon.segmentation.left_out import LeftOut
+from recon.segmentation.mass_network import Looks
 from recon.segmentation.mass_uncertainty import Sigma, Speeds
 from recon.segmentation.masses import Mass
 from recon.segmentation.refraction import Sound
@@ -51,11 +52,12 @@ def find_masses(
     overlays: int = OVERLAYS,
     speed_sigmas: tuple[float, float] = (0.0, 0.0),
     blur: Blur | None = None,
+    looks: Looks | None = None,
 ) -> Segmented:
     """Find masses; with a skin, whether they lie under it.
 
     speed_sigmas : m/s, standard deviations of the speeds of sound in the tissue and in masses.
-    blur : of the B-scans, as of `masses.from_scans`.
+    blur, looks : as of `masses.from_scans`.
 
     Raises
     ------
@@ -71,12 +73,15 @@ def find_masses(
         scans = freehand_scans.in_memory(rest.undone(scans, moved))
     sound, placed = Sound(scans.speed_m_s, mass_m_s), scans.world_from_pixel
     grey = masses.tissue_grey(scans.stream(), scans.shape, placed)
-    found, left_out, uneven_db = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur)
+    found, left_out, uneven_db = masses.from_scans(scans.stream, scans.shape, placed, sound, dynamic_range_db, grey, blur, looks)
     figures: Metrics = {"tissue_grey": grey, "masses": len(found), "left_out": len(left_out)}
     none_found = "none: no body that differs from the tissue on all sides of it; one at the images' side needs strokes beside"
     if np.isfinite(uneven_db):
         figures["tissue_uneven_db"] = uneven_db
-    sought = "" if uneven_db < rough_bodies.FAINT.even_db else ": too uneven for bright or faint masses, none were looked for"
+    by_looks = (looks or Looks()).sees(uneven_db)
+    sought = ": as a breast, masses are told by their looks" if by_looks else ""
+    if not by_looks and uneven_db >= rough_bodies.FAINT.even_db:
+        sought = ": too uneven for bright or faint masses, none were looked for"
     lines = [
         f"tissue      grey {grey:.0f} of 255, uneven by {uneven_db:.1f} dB{sought}",
         *([] if found else [f"masses      {none_found}"]),

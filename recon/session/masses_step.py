@@ -17,7 +17,8 @@ from recon.freehand.scans import Scans, ScansFields
 from recon.freehand.volume_compounding import Clip, Rectangle
 from recon.model.probe import SCANNER_SPEED, Speed, SpeedSigma
 from recon.model.rig import Positive
-from recon.segmentation import containment, detectability, left_out, seen_map, segmented_scans
+from recon.segmentation import containment, detectability, left_out, mass_network, seen_map, segmented_scans
+from recon.segmentation.mass_network import Looks
 from recon.segmentation.seen_map import Seen
 from recon.segmentation.segmented_scans import Segmented
 from recon.segmentation.tube_wall import Appearance
@@ -37,6 +38,10 @@ class Method(EchoFields):
     """m/s in the masses: 1510 to 1570 in those of the breast"""
     mass_sigma_m_s: SpeedSigma = 20.0
     """m/s, standard deviation of the former, of which their volumes are uncertain"""
+    looks: Literal["auto", "always", "never"] = "auto"
+    """whether masses are told from tissue by a network, by their looks; auto: where the tissue is as uneven as a breast"""
+    network: Path | None = None
+    """masses.onnx of `sonotwin train network=masses`; null is the one that comes with the software"""
     dynamic_range_db: Annotated[float, Field(ge=20, le=120)] = 60.0
     """dB from black to white, as set on the scanner"""
     diameter_mm: tuple[Positive, Positive] = (5.0, 36.0)
@@ -142,8 +147,9 @@ def find(
                 found = segmented_scans.find_tube(scans, chosen.tube, chosen.overlays, skin)
             else:
                 sigmas, sound = (tissue_sigma_m_s, chosen.mass_sigma_m_s), chosen.mass_m_s
+                looks = Looks(chosen.looks, None if chosen.network is None else mass_network.opened(chosen.network))
                 found = segmented_scans.find_masses(
-                    scans, skin, sound, chosen.dynamic_range_db, chosen.overlays, sigmas, chosen.blur
+                    scans, skin, sound, chosen.dynamic_range_db, chosen.overlays, sigmas, chosen.blur, looks
                 )
     except InputError as error:
         raise error if str(error).startswith(source) else InputError(f"{source}: {error}") from None
