@@ -19,7 +19,7 @@ from recon.segmentation.left_out import LeftOut, Reason
 from recon.segmentation.mass_network import Looks
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
-from recon.segmentation.rough_bodies import FAINT, LIMITS, LOOK, Found, Rough, faint, likely, rough, say
+from recon.segmentation.rough_bodies import FAINT, LIMITS, LOOK, Found, Rough, faint, in_words, likely, rough, say
 from recon.segmentation.shadow_clearing import Recording, cleared, passed
 
 Array = NDArray[np.float64]
@@ -120,8 +120,9 @@ def from_scans(
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
     masses = [part for mass in masses for part in parted(mass, power.volume.directions)]
+    left_out = begun.left_out + left_out
     say(left_out)
-    return Found(sorted(masses, key=lambda mass: -mass.volume), begun.left_out + left_out, begun.uneven_db)
+    return Found(sorted(masses, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
 
 
 def _by_looks(
@@ -132,21 +133,38 @@ def _by_looks(
     chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip, network)
     found = likely(chance, power, begun)
     masses, left_out = found.masses, found.left_out
-    near_mm = 1.0  # of a mass's border: what a dark body has in common with it
-    taken = distances(masses, grid) if masses else None
+    known = [*(mass.centre for mass in masses), *(np.array(one.centre_mm) for one in left_out if one.reason != "gap")]
     for dark in begun.masses:
-        core = _core(dark)
-        shares = _sampled(chance, core)
-        if taken is not None and np.nanmin(_sampled(EchoPower(taken, power.weight), core), initial=np.inf) < near_mm:
+        if any((np.abs(dark.centre - centre) < dark.mesh.extents / 2).all() for centre in known):
             continue
-        reason: Reason = "looks like tissue" if np.nanmean(shares) < LOOK.denied else "unsure"
+        reason = _looks(chance, _core(dark))
         left_out.append(_left_out(reason, dark, power, LOOK_WAYS[reason]))
+    inner = LIMITS.core / 2 * np.stack(np.meshgrid(*3 * ((-1, 0, 1),)), axis=-1).reshape(-1, 3)
+    for one in begun.left_out:
+        centre = np.array(one.centre_mm)
+        if one.reason == "gap" or any((np.abs(centre - other) < np.array(one.extents_mm) / 2).all() for other in known):
+            continue
+        reason = _looks(chance, centre + inner * one.extents_mm @ power.volume.directions.T)
+        text = f"a dark body of {one.volume_mm3:.0f} mm3 at {in_words(one.centre_mm)} mm is left out: {LOOK_WAYS[reason]}"
+        left_out.append(one.model_copy(update={"reason": reason, "text": text}))
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses = refined(masses, power, times)
+    kept = list[Mass]()
+    for number, mass in enumerate(masses):
+        if not mass.bright and passed(recording, grid, masses, number, sound) < LIMITS.passed:
+            left_out.append(_left_out("its shadow hides its back", mass, power, "it is dark behind it, so its back isn't seen"))
+        else:
+            kept += parted(mass, power.volume.directions)
     say(left_out)
-    return Found(sorted(masses, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
+    return Found(sorted(kept, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
+
+
+def _looks(chance: EchoPower, places: Array) -> Reason:
+    """Whether a dark body that isn't measured looks like tissue, at places : (n, 3) in it."""
+    share = float(np.mean(np.nan_to_num(_sampled(chance, places))))
+    return "looks like tissue" if share < LOOK.denied else "unsure"
 
 
 def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:

@@ -156,7 +156,7 @@ class Rough(NamedTuple):
 def rough(power: EchoPower) -> Rough:
     """Dark bodies with tissue all around, without the shadows that hang on to them.
 
-    Left out, and logged with their reasons, are bodies that the scan's side, end or a gap cuts, those behind them, streaks down
+    Left out, with their reasons, are bodies that the scan's side, end or a gap cuts, those behind them, streaks down
     the beam, which may be shadows of borders, weak ones, and small ones where they are many.
     """
     spacing = power.volume.spacing[::-1]
@@ -199,7 +199,6 @@ def rough(power: EchoPower) -> Rough:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), ratio[one.part], 1.0)
             masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
             kept.append(one)
-    say(left_out)
     return Rough(masses, left_out, uneven_db, shadowed | (dark & ~_mask(kept, dark.shape)), gap)
 
 
@@ -409,11 +408,11 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
     spacing = power.volume.spacing[::-1]
     thick = _thickness(one.inside, spacing)
     extents, centre = _extents(ndimage.find_objects(one.inside.astype(int))[0], spacing), _middle(one.inside, one.part, power)
-    place = f"{one.volume:.0f} mm3 at {_told(centre)} mm"
+    place = f"{one.volume:.0f} mm3 at {in_words(centre)} mm"
     match reason:
         case "streak down the beam":
             centre = _middle(one.inside & (np.cumsum(one.inside.any(axis=(0, 2))) * spacing[1] < thick)[:, None], one.part, power)
-            text = f"a streak from {_told(centre)} mm on, {extents[1]:.0f} mm down the beam and "
+            text = f"a streak from {in_words(centre)} mm on, {extents[1]:.0f} mm down the beam and "
             text += f"{thick:.0f} mm thick, is left out: a shadow of a border, "
             text += f"or a body longer down the beam than {LIMITS.streak:g} times its thickness"
         case "behind a cut body":
@@ -467,7 +466,7 @@ def gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
             inside = labels[part] == one
             if (volume := inside.sum() * float(np.prod(spacing))) >= GAP.least_mm3:
                 wide, centre = float(np.median(width[part][inside])), _middle(np.ones_like(inside), part, power)
-                text = f"a gap of {wide:.1f} mm {where}, {volume:.0f} mm3 about {_told(centre)} mm, wasn't scanned: "
+                text = f"a gap of {wide:.1f} mm {where}, {volume:.0f} mm3 about {in_words(centre)} mm, wasn't scanned: "
                 text += "masses in it may be missed"
                 extents = _extents(part, spacing)
                 found.append(LeftOut(reason="gap", volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text))
@@ -533,11 +532,11 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         centre = _middle(inside, middle, power)
         if ends and (beside & ~here).sum() > (1 - CUT.mostly) * beside.sum():
             reason: Reason = "behind the tissue"
-            text = f"the dark behind the tissue, {volume:.0f} mm3 about {_told(centre)} mm, "
+            text = f"the dark behind the tissue, {volume:.0f} mm3 about {in_words(centre)} mm, "
             text += "holds no mass, or one that isn't told from it"
         else:
             reason = max(sides, key=lambda name: sides[name])
-            text = f"a dark body is {reason}, and is left out: {volume:.0f} mm3 of it at {_told(centre)} mm, "
+            text = f"a dark body is {reason}, and is left out: {volume:.0f} mm3 of it at {in_words(centre)} mm, "
             text += f"{along:.0f} x {height:.0f} x {across:.0f} mm; {CUT_WAYS.get(reason, 'scan on there')}"
         left_out.append(LeftOut(reason=reason, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text))
         if reason == "behind the tissue":
@@ -608,7 +607,7 @@ def _extents(part: Part, spacing: Array) -> Place:
     return along, deep, across
 
 
-def _told(centre: Place) -> str:
+def in_words(centre: Place) -> str:
     """A place for people."""
     return ", ".join(f"{value:.0f}" for value in centre)
 

@@ -86,7 +86,7 @@ def find_masses(
         f"tissue      grey {grey:.0f} of 255, uneven by {uneven_db:.1f} dB{sought}",
         *([] if found else [f"masses      {none_found}"]),
     ]
-    lines += [f"blur        {blur}"] if blur is not None and found else []
+    lines += [f"blur        {blur}"] if blur is not None and found and not by_looks else []
     for one in (touching, moved):
         figures |= {} if one is None else one.figures
         lines += [] if one is None else one.lines

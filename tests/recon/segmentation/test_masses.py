@@ -1,6 +1,7 @@
 """Are dark bodies found, and as large as they are, in averaged power with walls and shadows?"""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.segmentation import masses, rough_bodies
 from recon.segmentation.echo_power import EchoPower
+from recon.segmentation.mass_network import Looks
 from recon.segmentation.masses import refined
-from recon.segmentation.rough_bodies import rough
+from recon.segmentation.rough_bodies import rough, say
 
 SPACING = np.array(masses.SPACING_MM)
 SIZE = (np.array([36, 36, 32]) / SPACING).astype(int)  # nx, ny, nz
@@ -41,7 +43,9 @@ def ball():
 
 
 def find(power):
-    return refined(rough(power).masses, power, masses.REFINEMENTS[-1])
+    first = rough(power)
+    say(first.left_out)
+    return refined(first.masses, power, masses.REFINEMENTS[-1])
 
 
 VOLUME = 4 / 3 * np.pi * RADIUS**3
@@ -255,3 +259,51 @@ def test_an_opening_is_one_by_distances(rng, spacing):
     assert 0 < core.sum() < mask.sum() < mask.size
     opened = mask & (ndimage.distance_transform_edt(~core, spacing) <= 1.75)
     np.testing.assert_array_equal(rough_bodies._opened(mask, 1.5, np.array(spacing)), opened)
+
+
+NEAR, FAR = (13.0, 15.0, 16.0), (28.0, 24.0, 16.0)  # middles of a very dark and a dark ball, mm
+BLACK = SimpleNamespace(run=lambda _, given: [40 * (0.2 - ndimage.gaussian_filter(given["scan"], (0, 0, 1.5, 1.5)))])
+"""stands in for the network: a mass is what is nearly black"""
+
+
+def grown_scans(rng, shadow=False):
+    """B-scans (160, 160) 0.8 mm apart of lobules 8 dB apart, with both balls in them, and their poses."""
+    step = 0.25
+    k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
+    places = np.stack([u * step, v * step, k * 0.8])
+    level = 4 * np.sign(ndimage.gaussian_filter(rng.standard_normal(k.shape), (2, 7, 7)))
+    for centre, radius, depth in ((NEAR, 5.0, -30.0), (FAR, 4.0, -14.0)):
+        away = np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) - radius
+        level = np.where(away < 0, depth, level)
+    if shadow:
+        beside = np.hypot(places[0] - NEAR[0], places[2] - NEAR[2])
+        level = np.where((beside < 5) & (places[1] > NEAR[1]), -30.0, level)
+    speckle = 10 * np.log10(rng.exponential(1.0, k.shape))
+    images = np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8)
+    poses = np.tile(np.diag([step, step, 1.0, 1.0]), (41, 1, 1))
+    poses[:, 2, 3] = 0.8 * np.arange(41)
+    return images, poses
+
+
+def test_in_grown_tissue_looks_tell_masses(rng, caplog):
+    """One ball is found and measured, by its border's fit; the other looks like tissue to the network, and is listed so, once.
+
+    By power alone both are masses. What is said is what is listed. Lobules that touch the border, half as dark, move it by up to 0.3 mm.
+    """
+    images, poses = grown_scans(rng)
+    found = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks(network=BLACK))
+    (mass,) = found.masses
+    assert found.uneven_db > 2.8 and np.linalg.norm(mass.centre - NEAR) < 0.3
+    assert mass.volume == pytest.approx(VOLUME, rel=0.2)
+    (denied,) = (one for one in found.left_out if np.linalg.norm(np.array(one.centre_mm) - FAR) < 3)
+    assert denied.reason == "looks like tissue"
+    assert {one.text for one in found.left_out} >= set(caplog.messages)
+    without = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks("never"))
+    assert len(without.masses) == 2
+
+
+def test_a_mass_by_looks_whose_back_is_hidden_is_no_mass(rng):
+    images, poses = grown_scans(rng, shadow=True)
+    found = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks(network=BLACK))
+    near = [one.reason for one in found.left_out if np.linalg.norm(np.array(one.centre_mm)[::2] - [NEAR[0], NEAR[2]]) < 3]
+    assert not found.masses and near
