@@ -288,7 +288,7 @@ def grown_scans(rng, shadow=False):
 def test_in_grown_tissue_looks_tell_masses(rng, caplog):
     """One ball is found and measured, by its border's fit; the other looks like tissue to the network, and is listed so, once.
 
-    By power alone both are masses. What is said is what is listed. Lobules that touch the border, half as dark, move it by up to 0.3 mm.
+    By power alone both are masses. What is said is listed. Lobules that touch the border, half as dark, move it by up to 0.3 mm.
     """
     images, poses = grown_scans(rng)
     found = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks(network=BLACK))
