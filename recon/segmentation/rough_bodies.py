@@ -287,10 +287,12 @@ def likely(chance: EchoPower, power: EchoPower, begun: Rough) -> Found:
 
 def _wide_gaps(power: EchoPower) -> Mask:
     """Voxels in gaps of the scan that cut masses in two."""
-    spacing, wide = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool)
-    for axis in (0, 2):
+    spacing, gaps, wide = power.volume.spacing[::-1], *np.zeros((2, *power.weight.shape), bool)
+    for axis in (0, 2):  # what lies between two B-scans is no gap along the array
         width = _gap_widths(power.seen, axis, float(spacing[axis]))
-        wide |= np.isfinite(width) & (width >= GAP.widths_mm[0])
+        width[gaps | (width > GAP.widths_mm[1])] = 0
+        gaps |= width > 0
+        wide |= width >= GAP.widths_mm[0]
     return wide
 
 

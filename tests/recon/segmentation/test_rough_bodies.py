@@ -195,3 +195,11 @@ def test_a_body_in_a_gap_is_cut_by_it(rng):
     chance.weight[gap], chance.volume.voxels[gap] = 0, 0
     found = rough_bodies.likely(chance, power, begun(gap))
     assert {one.reason for one in found.left_out} == {"cut by a gap in the sweep"} and not found.masses
+
+
+def test_what_lies_between_two_scans_of_a_stroke_is_no_gap_beside_another_stroke(rng):
+    """Sheets between B-scans are unseen but where a stroke beside covers them; a body there is whole."""
+    chance, power = looks((5.0, 0.9, CENTRE)), speckled(np.ones(PLACES.shape[:3]), rng)
+    between = (np.arange(SIZE[2]) % 2 == 1)[:, None, None] & (np.abs(PLACES[..., 0] - CENTRE[0]) < 12)
+    chance.weight[between], chance.volume.voxels[between] = 0, 0
+    assert len(rough_bodies.likely(chance, power, begun()).masses) == 1
