@@ -104,6 +104,14 @@ class Config(BaseModel):
                 raise ValueError(f"{name}: expected none for network=masses, which trains with whole B-scans, found {found}")
         return self
 
+    @field_validator("data", "validation_data", mode="before")
+    @classmethod
+    def _named(cls, given: object) -> object:
+        """Refuse a variable of the shell that is empty: it would be the folder in which the command is run."""
+        if "" in (given if isinstance(given, list | tuple) else [given]):
+            raise ValueError("expected a folder, found an empty name")
+        return given
+
     @field_validator("scales")
     @classmethod
     def _least_first(cls, given: tuple[float, float]) -> tuple[float, float]:
