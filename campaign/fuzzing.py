@@ -23,7 +23,8 @@ NAMES = (
     "probe", "target", "tip", "lag", "stamps", "track", "authors_poses", "pairs",
     "pose_table", "image", "mesh", "model_stl", "model_glb",
     "volume_nrrd", "volume_mha", "sequence", "plus_config", "plus_phantom", "messages", "dicom", "video",
-    "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "centres", "checkpoint", "network",
+    "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "centres", "outlines", "checkpoint", "network",
+    "mass_network",
 )  # fmt: skip
 
 

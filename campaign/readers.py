@@ -26,10 +26,11 @@ from recon.freehand import plus_config, sequences
 from recon.model.rig import Target
 from recon.probe_calibration import plus_phantom
 from recon.rig_check import check_log
+from recon.segmentation import mass_network
 from recon.skin_projection import planned_cut
 from recon.tracking import networks
 from sonotwin import config
-from trainers import export, markerpose_layout, shard_reader
+from trainers import export, markerpose_layout, scan_reader, shard_reader
 from twin import session
 
 
@@ -54,6 +55,10 @@ def _manifest(path: Path) -> object:
 
 def _shard(path: Path) -> object:
     return shard_reader.read_views([path.parent])
+
+
+def _outlines(path: Path) -> object:
+    return scan_reader.read_scans([path.parent])
 
 
 def _sequence(path: Path) -> object:
@@ -110,7 +115,9 @@ READERS = {
     "points": Reader(lambda path: npz.read(path, POINTS), ("small.npz",)),
     "shard": Reader(_shard, ("data/shard-00000.tar",), "shard-00000.tar"),
     "centres": Reader(markerpose_layout.read_table, ("markerpose/data_centers.csv",), "data_centers.csv"),
+    "outlines": Reader(_outlines, ("outlined/outlines.csv",), "outlines.csv"),
     "checkpoint": Reader(export.read_state, ("small.pt",)),
     "network": Reader(lambda path: networks.session(path, networks.SEGMENTER), ("networks/segmenter.onnx",), "file.onnx"),
+    "mass_network": Reader(mass_network.opened, ("masses.onnx",), "file.onnx"),
 }  # fmt: skip
 DESIGN = _design()

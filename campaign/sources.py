@@ -163,6 +163,7 @@ COMMANDS = (
             ("volume/sequence.igs.mha", "plus.xml")),
     Command("segment", ("capture=scan/capture",), ("scan",), SCAN),
     Command("segment", ("sequence=volume/sequence.igs.mha", "kind=masses"), ("volume",), ("volume/sequence.igs.mha",)),
+    Command("segment", ("capture=scan/capture", "network=masses.onnx"), ("scan", "masses.onnx"), ("masses.onnx",)),
     Command("fuse", ("capture=scan/capture", "surface=skin/surface.ply", "volume=volume", "part_table=false"),
             ("scan", "skin", "volume"), (*SCAN, "skin/surface.ply", "volume/volume.nrrd")),
     Command("reconstruct", ("capture=scan/capture", "probe=probe/probe.yaml"), ("scan", "probe"),
@@ -192,6 +193,9 @@ COMMANDS = (
             ("markerpose/data_centers.csv", "markerpose/images/im1.png")),
     Command("train", ("network=segmenter", "data=markerpose", "steps=2", "batch=2"), ("markerpose",),
             ("markerpose/patch120/000001.png", "markerpose/mask120/000002.png")),
+    Command("train", ("network=masses", "data=scan", "validation_data=outlined", "steps=2", "batch=2"), ("scan", "outlined"),
+            (*SCAN, "scan/truth/sweep/labels/0003.png", "outlined/outlines.csv", "outlined/image.png", "outlined/mask.png"),
+            ("scan/truth/scene.json",)),
     Command("export", ("layout=markerpose", "data=data", "capture=film/capture"), ("data", "film"),
             ("data/shard-00001.tar", *_film("film"))),
     Command("import", ("layout=markerpose", "folder=markerpose"), ("markerpose",),
@@ -232,12 +236,15 @@ def _write_others(folder: Path) -> None:
 
     import yaml
 
+    from recon.segmentation import mass_network
     from recon.tracking import networks
 
     shutil.copytree(folder / "ball/capture/surface/cam1", folder / "shots", dirs_exist_ok=True)
     patterns = surface_part.read_surface(folder / "ball/capture").patterns
     (folder / "patterns.yaml").write_text(yaml.safe_dump(json.loads(patterns.model_dump_json())), encoding="utf-8")
     shutil.copytree(networks.WEIGHTS, folder / "networks", dirs_exist_ok=True)
+    shutil.copy(mass_network.WEIGHTS, folder / "masses.onnx")
+    _write_outlined(folder / "outlined")
     shown = made_clips.screens(made_clips.scans(24))
     made_clips.write_dicom(folder / "scan.dcm", shown, FrameTime=50.0)
     made_clips.write_video(folder / "screen.avi", shown, 20.0)
@@ -253,6 +260,17 @@ def _write_others(folder: Path) -> None:
     _write_small_ones(folder)
     _write_tool(folder)
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
+
+
+def _write_outlined(folder: Path) -> None:
+    """A breast image of others, with the outline of a mass."""
+    import cv2
+
+    folder.mkdir(exist_ok=True)
+    mask = cv2.circle(np.zeros((160, 200), np.uint8), (90, 70), 30, 255, -1)
+    for name, pixels in (("image", np.random.default_rng(0).integers(1, 256, mask.shape, np.uint8)), ("mask", mask)):
+        cv2.imwrite(str(folder / f"{name}.png"), pixels)
+    (folder / "outlines.csv").write_text("image,mask,mm_per_px\nimage.png,mask.png,0.2\n", encoding="utf-8")
 
 
 def _write_exported(folder: Path) -> None:

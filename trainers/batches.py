@@ -167,18 +167,18 @@ def discs(patches: Patches, size: int, generator: Generator) -> Discs:
 
 def scans(data: Scans, size: int, generator: Generator) -> Discs:
     """`size` random B-scans with their masses, mirrored, tilted, scaled and of another scanner."""
-    shows = np.flatnonzero(data.masks.max((1, 2)) > 0)
     which = torch.randint(len(data), (size,), generator=generator).numpy()
-    if len(shows):
-        some = torch.randint(len(shows), (size,), generator=generator).numpy()
-        which = np.where((torch.rand(size, generator=generator) < SHOWS_MASS).numpy(), shows[some], which)
-    images, masks = data.images[which], data.masks[which]
-    width = images.shape[2]
+    if len(data.shows):
+        some = torch.randint(len(data.shows), (size,), generator=generator).numpy()
+        which = np.where((torch.rand(size, generator=generator) < SHOWS_MASS).numpy(), data.shows[some], which)
+    images, masks, (height, width) = data.images[which], data.masks[which], data.size[which].T
     linear = tilts(size, generator)
-    source = torch.tensor([(width - 1) / 2, 0.0]) + torch.zeros(size, 2)
+    source = torch.from_numpy(np.column_stack([(width - 1) / 2, np.zeros(size)])).float()
     goal = torch.tensor([(SCAN[0] - 1) / 2, 0.0]) + uniform(-1.0, 1.0, (size, 2), generator) * torch.tensor([12.0, 8.0])
     change = (linear, source, goal, SCAN)
-    known = (warp(np.full_like(images, 255), *change, torch.zeros(size)) > 254).float()
+    v, u = np.ogrid[: images.shape[1], : images.shape[2]]
+    own = (v < height[:, None, None]) & (u < width[:, None, None])
+    known = (warp(255 * own.astype(np.uint8), *change, torch.zeros(size)) > 254).float()
     masks = warp(masks, *change, torch.zeros(size)) / 255
     return Discs(scanned(warp(images, *change, torch.zeros(size)), generator) / WHITE, masks, known)
 

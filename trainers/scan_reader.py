@@ -1,11 +1,14 @@
 """Reads B-scans with their masses, as the network that finds these sees them: rendered sweeps, or images with outlines.
 
 Outlines of others, such as of public breast images, come as a folder with `outlines.csv`: a row an image with the columns
-`image` and `mask`, files in the folder, of one size, the mask white within lesions; and `mm_per_px`, the size of a pixel.
+`image` and `mask`, files in the folder, of one size, the mask 255 within lesions and 0 elsewhere; and `mm_per_px`, the size of a
+pixel.
 """
 
 import csv
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import functools
+import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,20 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from recon.capture.image_formats import decode_image
+from recon.capture.image_formats import decode_image, size_of
 from recon.capture.images import read_image
 from recon.capture.manifest import MANIFEST, image_name
-from recon.capture.sweep_part import read_sweep
-from recon.errors import InputError, reason, short, validated
+from recon.capture.sweep_part import SweepCapture, read_sweep
+from recon.errors import InputError, short, validated
 from recon.files import json_text
-from recon.files.regular import read_bytes
+from recon.files.regular import MOST_TABLE, opened, read_bytes
 from recon.segmentation import mass_network
 
 Grey = NDArray[np.uint8]
+Pairs = Iterator[tuple[Grey, Grey]]
 
 CAPTURE, SCENE, LABELS = "capture", Path("truth", "scene.json"), Path("truth", "sweep", "labels")
-MASS = "mass"  # how labels of masses begin; a complex cyst's solid part is one's, too
-SOLID = "solid"
+MASS = re.compile(r"(mass|solid|tumour)\d+")  # labels of masses, and of a complex cyst's solid part, which is one's, too
 OUTLINES, COLUMNS = "outlines.csv", ("image", "mask", "mm_per_px")
 
 
@@ -37,10 +40,16 @@ class Scans:
 
     images: Grey  # (n, h, w)
     masks: Grey  # (n, h, w) 255 within a mass
+    size: NDArray[np.int64]  # (n, 2) height and width of a B-scan; to the right and below it is black
     sample: NDArray[np.int64]  # (n,) which sweep a B-scan is of
 
     def __len__(self) -> int:
         return len(self.images)
+
+    @functools.cached_property
+    def shows(self) -> NDArray[np.int64]:
+        """Numbers of the B-scans with a mass."""
+        return np.flatnonzero([mask.any() for mask in self.masks])
 
 
 class _Scene(BaseModel):
@@ -50,64 +59,100 @@ class _Scene(BaseModel):
     labels: list[str]
 
 
-def read_scans(folders: Sequence[Path], tell: Callable[[int], None] = lambda count: None) -> Scans:
+@dataclass(frozen=True)
+class _Sample:
+    """B-scans of one sweep, or an image with its outline, not read yet."""
+
+    count: int
+    shape: tuple[int, int]  # of its images: h, w
+    pixel_mm: tuple[float, float]  # width and height of a pixel
+    pairs: Callable[[], Pairs]  # reads images and masks
+
+
+def read_scans(folders: Sequence[Path], tell: Callable[[int], None] = lambda count: None, partial: bool = False) -> Scans:
     """All B-scans of some folders: each is that of one sweep, of many, or of images with outlines, each a sample of its own.
+
+    partial : leaves out sweeps that aren't finished
 
     Raises
     ------
     InputError
-        If a folder has neither sweeps nor outlines, or one that is damaged, or has no truth.
+        If a folder has neither sweeps nor outlines, or one that is damaged, unfinished, or has no truth.
     """
-    images, masks, sample = list[Grey](), list[Grey](), list[int]()
-    for number, pairs in enumerate(pairs for folder in folders for pairs in _samples(folder)):
-        for image, mask in pairs:
-            images.append(image)
-            masks.append(mask)
-            sample.append(number)
-        tell(len(images))
-    height, width = np.max([image.shape for image in images], axis=0)
-    wide, inside = (np.stack([_padded(image, height, width) for image in some]) for some in (images, masks))
-    return Scans(wide, inside, np.array(sample))
+    samples = [sample for folder in folders for sample in _samples(folder, partial)]
+    counts = [sample.count for sample in samples]
+    if not sum(counts):
+        raise InputError("data: expected B-scans, found none")
+    own = np.array([mass_network.reduced_size(sample.shape, sample.pixel_mm) for sample in samples])
+    height, width = (-(-own.max(axis=0) // mass_network.MULTIPLE) * mass_network.MULTIPLE).tolist()
+    images, masks = np.zeros((2, sum(counts), height, width), np.uint8)
+    k = 0
+    for sample in samples:
+        for pair in sample.pairs():
+            for wide, one in zip((images, masks), pair, strict=True):
+                small = mass_network.reduced(one, sample.pixel_mm)
+                wide[k, : small.shape[0], : small.shape[1]] = small
+            k += 1
+        tell(k)
+    return Scans(images, masks, np.repeat(own, counts, axis=0), np.repeat(np.arange(len(samples)), counts))
 
 
-def _samples(folder: Path) -> Iterator[Iterable[tuple[Grey, Grey]]]:
-    """B-scans and masks of each sweep, or of each image with an outline, in a folder."""
+def _samples(folder: Path, partial: bool) -> list[_Sample]:
+    """Each sweep, or each image with an outline, in a folder."""
     if (folder / OUTLINES).is_file():
-        return ([pair] for pair in _outlined(folder))
+        return list(_outlined(folder))
     if (folder / CAPTURE).is_dir():
-        return iter([_read(folder)])
-    found = sorted(path.parent for path in folder.glob(f"*/{CAPTURE}") if (path / MANIFEST).is_file())
+        return [_sweep(folder)]
+    begun = sorted({path.parent for name in (CAPTURE, f".{CAPTURE}.*") for path in folder.glob(f"*/{name}")})
+    found = [sweep for sweep in begun if (sweep / CAPTURE / MANIFEST).is_file()]
+    if len(found) < len(begun) and not partial:
+        sweep = next(sweep for sweep in begun if sweep not in found)
+        raise InputError(f"{sweep / CAPTURE / MANIFEST}: expected a finished sweep, found none; partial=true leaves it out")
     if not found:
         raise InputError(f"{folder}: expected sweeps, as of `sonotwin sweep count=100`, or {OUTLINES}, found none")
-    return (_read(sweep) for sweep in found)
+    return [_sweep(sweep) for sweep in found]
 
 
-def _outlined(folder: Path) -> Iterator[tuple[Grey, Grey]]:
+def _outlined(folder: Path) -> Iterator[_Sample]:
     """Images and masks of a table."""
     path = folder / OUTLINES
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        try:
-            rows = list(csv.DictReader(file))
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: expected a table, found {reason(error)}") from None
+    try:
+        lines = read_bytes(path, MOST_TABLE).decode("utf-8-sig").splitlines()
+        rows = list(csv.DictReader(lines))
+    except (csv.Error, UnicodeDecodeError):
+        raise InputError(f"{path}: expected a table as CSV text, found other or damaged data") from None
     if not rows:
         raise InputError(f"{path}: expected a row for each image, found none")
     for number, row in enumerate(rows, start=2):
         place = f"{path}: line {number}"
         if missing := [name for name in COLUMNS if not row.get(name)]:
             raise InputError(f"{place}: expected {', '.join(COLUMNS)}, found no {missing[0]}")
-        image, mask = (_grey(folder / row[name]) for name in COLUMNS[:2])
-        if image.shape != mask.shape:
-            sizes = " and ".join(f"{one.shape[1]}x{one.shape[0]}" for one in (image, mask))
-            raise InputError(f"{place}: expected image and mask of one size, found {sizes}")
+        files = folder / row["image"], folder / row["mask"]
+        (width, height), other = map(_size, files)
+        if (width, height) != other:
+            found = f"{width}x{height} and {other[0]}x{other[1]}"
+            raise InputError(f"{place}: expected image and mask of one size, found {found}")
         try:
             mm = float(row["mm_per_px"])
         except ValueError:
             mm = np.nan
         if not 0.01 <= mm <= 1:
             raise InputError(f"{place}: mm_per_px: expected 0.01 to 1, found {short(row['mm_per_px'])}")
-        inside = np.where(mask > 127, 255, 0).astype(np.uint8)
-        yield mass_network.reduced(image, (mm, mm)), mass_network.reduced(inside, (mm, mm))
+        yield _Sample(1, (height, width), (mm, mm), functools.partial(_outline, *files))
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file."""
+    with opened(path, expected="an image") as stream:
+        return size_of(path, stream)
+
+
+def _outline(image: Path, mask: Path) -> Pairs:
+    """The pair of an image and a mask."""
+    inside = _grey(mask)
+    if other := set(np.unique(inside).tolist()) - {0, 255}:
+        raise InputError(f"{mask}: expected a mask of 0 and 255, found {min(other)}")
+    yield _grey(image), inside
 
 
 def _grey(path: Path) -> Grey:
@@ -118,18 +163,20 @@ def _grey(path: Path) -> Grey:
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
 
 
-def _read(folder: Path) -> Iterator[tuple[Grey, Grey]]:
-    """B-scans of a sweep and their masks."""
+def _sweep(folder: Path) -> _Sample:
+    """A sweep with its truth."""
     sweep = read_sweep(folder / CAPTURE)
     if sweep.probe is None:
         raise InputError(f"{folder / CAPTURE}: expected the probe's calibration, for the size of pixels, found none")
     names = validated(_Scene, json_text.read(folder / SCENE), folder / SCENE).labels
-    inside = np.array([255 if name.startswith((MASS, SOLID)) else 0 for name in names] + [0] * (256 - len(names)), np.uint8)
-    pixel_mm = sweep.probe.scale[0], sweep.probe.scale[1]
+    inside = np.zeros(256, np.uint8)
+    inside[[k for k, name in enumerate(names[:256]) if MASS.fullmatch(name)]] = 255
+    (width, height), scale = sweep.size, sweep.probe.scale
+    pairs = functools.partial(_labelled, folder / LABELS, sweep, inside)
+    return _Sample(len(sweep.frames), (height, width), (scale[0], scale[1]), pairs)
+
+
+def _labelled(folder: Path, sweep: SweepCapture, inside: Grey) -> Pairs:
+    """B-scans of a sweep and their masks; inside : (256,) 255 of the labels of masses."""
     for number, frame in enumerate(sweep.frames):
-        labels = read_image(folder / LABELS / image_name(int(frame)), sweep.size, bits=8)
-        yield tuple(mass_network.reduced(one, pixel_mm) for one in (sweep.image(number), inside[labels]))
-
-
-def _padded(image: Grey, height: int, width: int) -> Grey:
-    return np.pad(image, ((0, height - image.shape[0]), (0, width - image.shape[1])))
+        yield sweep.image(number), inside[read_image(folder / image_name(int(frame)), sweep.size, bits=8)]

@@ -16,6 +16,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from recon import threads
+from recon.errors import InputError, reason
 from recon.freehand.volume_compounding import Clip, Grid
 from recon.segmentation import echo_power
 from recon.segmentation.echo_power import EchoPower, Placed
@@ -50,9 +51,19 @@ def opened(path: Path = WEIGHTS) -> onnxruntime.InferenceSession:
     Raises
     ------
     InputError
-        If the file is missing, isn't a network, or another one.
+        If the file is missing, isn't a network, or another one, such as of one size of images.
     """
-    return networks.session(path, INTERFACE, threads=1)
+    session = networks.session(path, INTERFACE, threads=1)
+    for height, width in ((MULTIPLE, 2 * MULTIPLE), (3 * MULTIPLE, MULTIPLE)):
+        scan = np.zeros((1, 1, height, width), np.float32)
+        try:
+            (logits,) = session.run(["mask"], {"scan": scan})
+        except networks.FAULTS as error:
+            raise InputError(f"{path}: expected a network of B-scans of any size, found {reason(error)}") from None
+        if np.shape(logits) != scan.shape:
+            found = "x".join(map(str, np.shape(logits)))
+            raise InputError(f"{path}: expected an answer for each pixel, 1x1x{height}x{width}, found {found}")
+    return session
 
 
 @cache
@@ -61,13 +72,19 @@ def shipped() -> onnxruntime.InferenceSession:
     return opened()
 
 
+def reduced_size(shape: tuple[int, int], pixel_mm: tuple[float, float]) -> tuple[int, int]:
+    """Height and width, px of the network's, of a B-scan : (h, w) of some pixel size, width and height in mm."""
+    (height, width), (wide_mm, high_mm) = shape, pixel_mm
+    return max(round(height * high_mm / PIXEL_MM), 1), max(round(width * wide_mm / PIXEL_MM), 1)
+
+
 def reduced(image: NDArray[np.uint8], pixel_mm: tuple[float, float]) -> NDArray[np.uint8]:
     """A B-scan : (h, w) of some pixel size, width and height in mm, as the network sees it.
 
-    Black all round on to the next multiple of its sizes, to the right and below.
+    To the right and below it is black on to the next multiple of its sizes, as beside the B-scans that the network learns from:
+    with the edge's pixels there the IoU of two trained networks in patients held out was lower by 0.08.
     """
-    height, width = image.shape
-    wide, high = (max(round(count * mm / PIXEL_MM), 1) for count, mm in ((width, pixel_mm[0]), (height, pixel_mm[1])))
+    high, wide = reduced_size((image.shape[0], image.shape[1]), pixel_mm)
     small = cv2.resize(image, (wide, high), interpolation=cv2.INTER_AREA)
     return np.pad(small, ((0, -high % MULTIPLE), (0, -wide % MULTIPLE)))
 
@@ -79,15 +96,24 @@ def averaged(
     clip: Clip,
     network: onnxruntime.InferenceSession | None = None,
 ) -> EchoPower:
-    """Mean probability of a mass on a grid, in place of power: `recon.segmentation.echo_power.averaged`."""
-    pixel_mm = echo_power.pixel_mm(world_from_pixel)
+    """Mean probability of a mass on a grid, in place of power: `recon.segmentation.echo_power.averaged`.
 
-    def place(chance: Map) -> Placed:
+    The network isn't asked about B-scans without a pose.
+    """
+    pixel_mm, session = echo_power.pixel_mm(world_from_pixel), network or shipped()
+    placed = set(np.flatnonzero(np.isfinite(world_from_pixel).all(axis=(1, 2))).tolist())
+    nothing = Placed(*np.empty((4, 0), np.float32))
+
+    def place(number: int, image: NDArray[np.uint8]) -> Placed:
+        if number not in placed:
+            return nothing
+        chance = _probability(image, pixel_mm, session)
         left, right, top, bottom = clip.bounds(chance.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
         return Placed(np.ascontiguousarray(chance[top : bottom + 1, left : right + 1]), np.ones_like(u), u, v)
 
-    return echo_power.accumulated(map(place, probabilities(images, pixel_mm, network)), world_from_pixel, grid)
+    parts = threads.mapped(lambda numbered: place(*numbered), enumerate(images))
+    return echo_power.accumulated(parts, world_from_pixel, grid)
 
 
 def probabilities(
@@ -95,12 +121,14 @@ def probabilities(
 ) -> Iterator[Map]:
     """Probability of a mass in each pixel of B-scans : n times (h, w), at their own resolution."""
     session = network or shipped()
+    return threads.mapped(lambda image: _probability(image, pixel_mm, session), images)
 
-    def answer(image: NDArray[np.uint8]) -> Map:
-        (height, width), small = image.shape, reduced(image, pixel_mm)
-        wide, high = (max(round(count * mm / PIXEL_MM), 1) for count, mm in ((width, pixel_mm[0]), (height, pixel_mm[1])))
-        (logits,) = session.run(["mask"], {"scan": small[None, None].astype(np.float32) / 255})
-        there = np.asarray(logits)[0, 0, :high, :wide]
-        return 1 / (1 + np.exp(-cv2.resize(there, (width, height), interpolation=cv2.INTER_LINEAR)))
 
-    return threads.mapped(answer, images)
+def _probability(image: NDArray[np.uint8], pixel_mm: tuple[float, float], session: onnxruntime.InferenceSession) -> Map:
+    """That of one B-scan : (h, w)."""
+    height, width = image.shape
+    high, wide = reduced_size((height, width), pixel_mm)
+    small = reduced(image, pixel_mm)
+    (logits,) = session.run(["mask"], {"scan": small[None, None].astype(np.float32) / 255})
+    there = np.asarray(logits)[0, 0, :high, :wide]
+    return 1 / (1 + np.exp(-cv2.resize(there, (width, height), interpolation=cv2.INTER_LINEAR)))

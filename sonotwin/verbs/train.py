@@ -1,5 +1,8 @@
 """Train a network of the tracker: the detector, which finds circles in a view, or the segmenter, which outlines one in a patch.
 
+`network=masses` trains the one that tells masses from tissue in B-scans, with sweeps and their truth as of `sonotwin sweep`, or
+with images and outlines.csv, all in memory; docs/training.md tells how.
+
 Reads data sets as of `sonotwin dataset`, one or several: ranges of one, or of other seeds; and folders of MarkerPose's training
 data (data_centers.csv with images/, patch120/ with mask120/), which come after these. Their images are decoded into memory,
 150 kB a sample for a detector and 170 kB for a segmenter, or read from the shards as they are needed where that is more than
@@ -14,6 +17,7 @@ half an hour to some hours; the published ones take 6 to 20 times as long.
     sonotwin train network=segmenter data=outputs/dataset validation_data=theirs out=outputs/segmenter steps=5500
     sonotwin train network=detector data=[outputs/first,outputs/second] out=outputs/detector max_minutes=600 memory_gb=8
     sonotwin train network=detector data=outputs/more init=outputs/detector/detector.safetensors out=outputs/detector2 steps=5000
+    sonotwin train network=masses data=outputs/patients out=outputs/masses max_minutes=30
 """
 
 import json
@@ -40,6 +44,7 @@ from trainers.architectures import Name, is_detector, network
 from trainers.batches import SCALES
 from trainers.checkpoints import TRAIN
 from trainers.fit import Fitted, Plan, Precision
+from trainers.scan_reader import Scans
 from trainers.shard_reader import Data
 from trainers.stored_images import StoredImages
 
@@ -90,6 +95,22 @@ class Config(BaseModel):
         if self.steps is None and self.max_minutes is None:
             raise ValueError("expected steps or max_minutes, found neither")
         return self
+
+    @model_validator(mode="after")
+    def _all_change_something(self) -> "Config":
+        """Refuse fields that change nothing of a network that trains with whole B-scans in memory."""
+        for name in ("crop_px", "scales", "memory_gb") if self.network == "masses" else ():
+            if (found := getattr(self, name)) != type(self).model_fields[name].default:
+                raise ValueError(f"{name}: expected none for network=masses, which trains with whole B-scans, found {found}")
+        return self
+
+    @field_validator("data", "validation_data", mode="before")
+    @classmethod
+    def _named(cls, given: object) -> object:
+        """Refuse a variable of the shell that is empty: it would be the folder in which the command is run."""
+        if "" in (given if isinstance(given, list | tuple) else [given]):
+            raise ValueError("expected a folder, found an empty name")
+        return given
 
     @field_validator("scales")
     @classmethod
@@ -215,13 +236,16 @@ def read(config: Config, console: Console) -> tuple[Data, Data]:
     if is_detector(config.network):
         reader, what = data_sets.read_views, "views"
     elif config.network == "masses":
-        reader, what = (lambda folders, tell=lambda count: None, partial=False: scan_reader.read_scans(folders, tell)), "B-scans"
+        reader, what = scan_reader.read_scans, "B-scans"
     with console.status("reading") as status:
         data = reader(config.data, lambda count: status.update(f"reading, {count} samples"), config.partial)
         if config.validation_data is not None:
             sets = data, reader(config.validation_data)
         else:
             sets = shard_reader.split(data, config.validation)
+        if isinstance(sets[0], Scans) and not len(sets[0].shows):
+            names = "labels mass0, solid0, tumour0 ..., or masks"
+            raise InputError(f"data: expected masses to train with, as of {names}, found none in {len(sets[0])} B-scans")
         memory = config.memory
         train, validation = shard_reader.as_fits(sets, memory, lambda count: status.update(f"decoding, {count} images"))
     console.print(f"read        {len(train)} {what} to train with, {len(validation)} to validate with", markup=False)

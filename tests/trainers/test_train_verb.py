@@ -57,6 +57,8 @@ def test_writes_the_network_and_goes_on(data_set, tmp_path, capsys):
         (["steps=1", "data=/nowhere"], "/nowhere: expected a folder with shards, shard-00000.tar ..., found no such folder"),
         (["steps=1", "data=[]"], "train: data: expected"),
         (["steps=1", "data=3"], "train: data: expected"),
+        (["steps=1", "data="], "train: data: expected a folder, found an empty name"),
+        (["steps=1", "validation_data=[/nowhere,'']"], "train: validation_data: expected a folder, found an empty name"),
         (["steps=1", "memory_gb=-1"], "train: memory_gb: expected"),
         (["steps=1", "memory_gb=inf"], "train: memory_gb: expected"),
         (["steps=1", "checkpoint_minutes=inf"], "train: checkpoint_minutes: expected"),

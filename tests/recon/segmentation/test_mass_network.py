@@ -65,9 +65,65 @@ def test_answers_are_averaged_in_space():
     assert inside.sum() * 0.25 == pytest.approx(cut, rel=0.04)
 
 
+def test_scans_without_a_pose_arent_looked_at():
+    """And as many images as poses are asked for, as elsewhere."""
+    asked = list[int]()
+
+    def run(_, inputs):
+        asked.append(int(inputs["scan"].max() * 255))
+        return bright(inputs)
+
+    poses = np.tile(np.diag([*PIXEL_MM, 1.0, 1.0]), (6, 1, 1))
+    poses[:, 2, 3] = np.arange(6)
+    poses[[0, 4]] = np.nan
+    scans = [np.full((400, 300), 10 * k, np.uint8) for k in range(6)]
+    grid = echo_power.beam_grid(poses, (400, 300), (0.5, 0.5, 1.0))
+    clip, counting = Clip(0, 0, 300, 400), SimpleNamespace(run=run)
+    mass_network.averaged(scans, poses, grid, clip, counting)
+    assert sorted(asked) == [10, 20, 30, 50]
+    for some in (scans[:-1], [*scans, scans[0]]):
+        with pytest.raises(InputError, match=r"^images: expected as many as poses, 6, found"):
+            mass_network.averaged(some, poses, grid, clip, counting)
+
+
+def test_sizes_are_those_of_what_is_made_smaller():
+    """Before the rim on to a multiple of 16; never none."""
+    assert mass_network.reduced_size((400, 300), PIXEL_MM) == (110, 98)
+    assert mass_network.reduced_size((3, 1), (0.02, 0.05)) == (1, 1)
+
+
 def test_another_network_is_refused():
     with pytest.raises(InputError, match=r"detector.onnx: inputs: expected scan \(nx1xnxn\), found image"):
         mass_network.opened(networks.WEIGHTS / "detector.onnx")
+
+
+@pytest.mark.parametrize("length", [0, 200, 100_000])
+def test_a_network_that_was_cut_short_is_refused(tmp_path, length):
+    path = tmp_path / "masses.onnx"
+    path.write_bytes(mass_network.WEIGHTS.read_bytes()[:length])
+    with pytest.raises(InputError, match=rf"^{path}: expected .*, found ") as caught:
+        mass_network.opened(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "stride", "message"),
+    [
+        ((1, 1, 16, 32), 1, r"expected a network of B-scans of any size, found "),
+        ((1, 1, "h", "w"), 2, r"expected an answer for each pixel, 1x1x16x32, found 1x1x8x16$"),
+    ],
+)
+def test_a_network_of_another_shape_is_refused(tmp_path, shape, stride, message):
+    """Of images of one size, or with coarser answers: it would fail in the middle of a sweep."""
+    onnx = pytest.importorskip("onnx")
+    tensor = onnx.helper.make_tensor_value_info
+    node = onnx.helper.make_node("MaxPool", ["scan"], ["mask"], kernel_shape=[1, 1], strides=[stride, stride])
+    ends = [tensor("scan", onnx.TensorProto.FLOAT, shape)], [tensor("mask", onnx.TensorProto.FLOAT, (1, 1, "hm", "wm"))]
+    graph = onnx.helper.make_graph([node], "g", *ends)
+    opset = [onnx.helper.make_opsetid("", 17)]
+    onnx.save(onnx.helper.make_model(graph, opset_imports=opset, ir_version=8), tmp_path / "other.onnx")
+    with pytest.raises(InputError, match=rf"^{tmp_path}/other.onnx: {message}"):
+        mass_network.opened(tmp_path / "other.onnx")
 
 
 def test_a_black_image_holds_no_mass():
