@@ -133,20 +133,17 @@ def _by_looks(
     chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip, network)
     found = likely(chance, power, begun)
     masses, left_out = found.masses, found.left_out
-    known = [*(mass.centre for mass in masses), *(np.array(one.centre_mm) for one in left_out if one.reason != "gap")]
-    for dark in begun.masses:
-        if any((np.abs(dark.centre - centre) < dark.mesh.extents / 2).all() for centre in known):
+    axes = power.volume.directions
+    named = [*(mass.centre for mass in masses), *(np.array(one.centre_mm) for one in left_out if one.reason != "gap")]
+    inner = LIMITS.core / 2 * np.stack(np.meshgrid(*3 * ((-1, 0, 1),)), axis=-1).reshape(-1, 3)  # of a body's extents
+    for dark in (*(_left_out("unsure", one, power, "") for one in begun.masses), *begun.left_out):
+        centre, extents = np.array(dark.centre_mm), np.array(dark.extents_mm)
+        if dark.reason == "gap" or any((np.abs((other - centre) @ axes) < extents / 2).all() for other in named):
             continue
-        reason = _looks(chance, _core(dark))
-        left_out.append(_left_out(reason, dark, power, LOOK_WAYS[reason]))
-    inner = LIMITS.core / 2 * np.stack(np.meshgrid(*3 * ((-1, 0, 1),)), axis=-1).reshape(-1, 3)
-    for one in begun.left_out:
-        centre = np.array(one.centre_mm)
-        if one.reason == "gap" or any((np.abs(centre - other) < np.array(one.extents_mm) / 2).all() for other in known):
-            continue
-        reason = _looks(chance, centre + inner * one.extents_mm @ power.volume.directions.T)
-        text = f"a dark body of {one.volume_mm3:.0f} mm3 at {in_words(one.centre_mm)} mm is left out: {LOOK_WAYS[reason]}"
-        left_out.append(one.model_copy(update={"reason": reason, "text": text}))
+        share = float(np.mean(np.nan_to_num(_sampled(chance, centre + inner * extents @ axes.T))))
+        reason: Reason = "looks like tissue" if share < LOOK.denied else "unsure"
+        text = f"a dark body of {dark.volume_mm3:.0f} mm3 at {in_words(dark.centre_mm)} mm is left out: {LOOK_WAYS[reason]}"
+        left_out.append(dark.model_copy(update={"reason": reason, "text": text}))
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
@@ -159,12 +156,6 @@ def _by_looks(
             kept += parted(mass, power.volume.directions)
     say(left_out)
     return Found(sorted(kept, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
-
-
-def _looks(chance: EchoPower, places: Array) -> Reason:
-    """Whether a dark body that isn't measured looks like tissue, at places : (n, 3) in it."""
-    share = float(np.mean(np.nan_to_num(_sampled(chance, places))))
-    return "looks like tissue" if share < LOOK.denied else "unsure"
 
 
 def _below_face(shape: tuple[int, int], world_from_pixel: Array) -> Clip:

@@ -33,7 +33,7 @@ class Method(EchoFields):
     """What is looked for in the B-scans, and its appearance."""
 
     kind: Literal["masses", "tube"] = "masses"
-    """what is looked for: masses, darker than the tissue around them; tube, round, in water"""
+    """what is looked for: masses, which differ from the tissue around them; tube, round, in water"""
     mass_m_s: Speed = SCANNER_SPEED
     """m/s in the masses: 1510 to 1570 in those of the breast"""
     mass_sigma_m_s: SpeedSigma = 20.0

@@ -78,7 +78,7 @@ class Settings(EchoFields, TissueFields, TargetField, BodyTargetFields, BoardLen
     spacing_mm: Spacing = 0.5
     """mm, of a volume's voxels; 0.01 to 100"""
     find: Literal["masses", "tube", "nothing"] = "masses"
-    """in the B-scans: masses, darker than the tissue around them; tube, round, in water, and the body about it; nothing"""
+    """in the B-scans: masses, which differ from the tissue around them; tube, round, in water, and the body about it; nothing"""
     overlays: bool = False
     """pictures of every pair of tracked frames, 0.1 MB and some hundredths of a second each"""
     reference: Path | None = None
