@@ -71,7 +71,8 @@ def _states(moment: Moment) -> Iterable[tuple[str, str]]:
     yield "Latency", NONE if late is None else f"{late.median_ms:.0f} ms, 99 % below {late.high_ms:.0f} ms"
     yield "Poses", NONE if late is None else f"{late.rate_hz:.0f} a second"
     if (seen := moment.seen) is not None:
-        yield "Seen", f"{100 * seen.share:.0f} % of {seen.planned_mm3 / 1000:.0f} cm³"
+        tissue = f"; tissue uneven by {seen.uneven_db:.1f} dB" if np.isfinite(seen.uneven_db) else ""
+        yield "Seen", f"{100 * seen.share:.0f} % of {seen.planned_mm3 / 1000:.0f} cm³, {seen.source}{tissue}"
 
 
 def _row(name: str, value: str) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from threading import Thread
 from time import monotonic
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -18,13 +19,14 @@ from recon.freehand import volume_compounding
 from recon.geometry import rigid
 from recon.navigation.newest import Every
 from recon.navigation.placed_scans import PlacedScan
-from recon.segmentation import containment, detectability, insonation, seen_map
+from recon.segmentation import containment, detectability, echo_power, insonation, rough_bodies, seen_map
 from recon.segmentation.detectability import Sought
-from recon.segmentation.insonation import Spread, Tally
+from recon.segmentation.insonation import Planned, Spread, Tally
 
 log = logging.getLogger(__name__)
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class LiveLimits:
     step_mm: float = 3.0  # of its grid: a browser shows as many points
     every_s: float = 0.5
     wait_s: float = 0.2  # for a B-scan, before looking whether to end
+    pixel_mm: float = 0.5  # in which the tissue's unevenness is measured
+    speckle_db: float = 0.55  # in single B-scans, that several average away: silicone has 0.91 dB instead of 0.72
 
 
 LIVE = LiveLimits()
@@ -48,13 +52,16 @@ class SeenSoFar:
     planned_mm3: float
     points: Map  # (n, 3) mm in the world, middles of voxels that weren't
     probability: Map  # (n,) that a mass with its middle there would have been found
+    uneven_db: float = np.nan  # standard deviation of the tissue's power; NaN where it couldn't be measured
+    source: str = detectability.source(0)  # of the coefficients
 
 
 @dataclass
 class RunningMap:
-    """The map of B-scans so far, on a grid along the first one.
+    """The map of B-scans so far, from the first one on that shows tissue.
 
     Planned is all that lies under the skin down to the images' depth; without a skin the same around what was touched so far.
+    B-scans in the air add nothing. One of another size, in colour or too far away for the grid is left out, which is logged once.
     """
 
     skin: trimesh.Trimesh | None = None
@@ -62,73 +69,135 @@ class RunningMap:
     spread: Spread = field(default_factory=Spread)
     face_row: float = 0.0
     tally: Tally | None = field(default=None, init=False)
-    _depth_mm: float = field(default=0.0, init=False)  # of the images
-    _planned: Map | None = field(default=None, init=False)  # (nz, ny, nx) mm below the skin; NaN elsewhere
+    left_out: int = field(default=0, init=False)
+    _planned: Planned | None = field(default=None, init=False)
+    _uneven_db: list[float] = field(default_factory=list, init=False)  # of each B-scan
+    _logged: set[str] = field(default_factory=set, init=False)  # reasons of what was left out
 
     def add(self, scan: PlacedScan) -> None:
-        """Take in a B-scan; one of another size than the first is left out.
-
-        Raises
-        ------
-        InputError
-            If the grid would be too large.
-        """
-        if self.tally is None:
-            self._begin(scan)
-        assert self.tally is not None
-        if scan.image.shape != self.tally.shape:
-            return
-        if self.skin is None:
-            self.tally = _holding(self.tally, scan.corners)
-        insonation.add(self.tally, scan.world_from_pixel, scan.image)
+        """Take in a B-scan."""
+        try:
+            self._add(scan)
+        except InputError as error:
+            self.left_out += 1
+            if (reason := str(error).partition(":")[0]) not in self._logged:
+                self._logged.add(reason)
+                log.warning("a B-scan is left out of what was seen, as will be others like it: %s", error)
 
     def seen(self) -> SeenSoFar | None:
         """The map so far; None before the first B-scan, or where nothing is planned."""
         if self.tally is None:
             return None
         where = insonation.insonation(self.tally, planned=self._planned)
-        margin_mm = (LIVE.step_mm + self.sought.size_mm) / 2  # a ball lies between ringing and lower end, wherever in its voxel
-        least_mm, most_mm = insonation.LIMITS.ringing_mm + margin_mm, self._depth_mm - margin_mm
-        planned = where.around & (where.under_mm >= least_mm) & (where.under_mm <= most_mm)
+        planned = seen_map.planned(where, self.sought.size_mm)
         if not planned.any():
             return None
-        found = seen_map.probability(where, self.sought, detectability.OBSERVER.even_db)
+        uneven_db = float(np.median(self._uneven_db)) if self._uneven_db else np.nan
+        calibration = detectability.calibration_for(uneven_db)
+        found = seen_map.probability(where, self.sought, uneven_db, calibration)
         left = planned & (found < seen_map.WELL)
-        points = insonation.centres(where.grid)[left].astype(np.float32)
-        return SeenSoFar(float(1 - left.sum() / planned.sum()), float(planned.sum()) * where.voxel_mm3, points, found[left])
+        points, share = insonation.centres(where.grid)[left].astype(np.float32), float(1 - left.sum() / planned.sum())
+        planned_mm3 = float(planned.sum()) * where.voxel_mm3
+        return SeenSoFar(share, planned_mm3, points, found[left], uneven_db, detectability.source(calibration.trials))
 
-    def _begin(self, scan: PlacedScan) -> None:
-        """Begin the tally, on a grid along a B-scan: over all that is planned, or with room around the B-scan."""
-        x, y = (scan.world_from_pixel[:3, axis] / np.linalg.norm(scan.world_from_pixel[:3, axis]) for axis in (0, 1))
-        directions, step = np.column_stack([x, y, np.cross(x, y)]), np.full(3, LIVE.step_mm)
-        height = scan.image.shape[0]
-        self._depth_mm = float((height - 1 - self.face_row) * np.linalg.norm(scan.world_from_pixel[:3, 1]))
+    def _add(self, scan: PlacedScan) -> None:
+        """Take in a B-scan; InputError if it has another size than the first or isn't grey, or the grid would be too large."""
+        insonation.check(scan.image, scan.image.shape if self.tally is None else self.tally.shape)
+        across, down = np.linalg.norm(scan.world_from_pixel[:3, :2], axis=0).tolist()
+        pixels = insonation.tissue(scan.image, (across, down), self.face_row)
+        if not pixels.any():
+            return
+        if self.tally is None:
+            self.tally = self._begun(scan)
+        elif self.skin is None:
+            self.tally = _holding(self.tally, scan.corners)
+        insonation.add(self.tally, scan.world_from_pixel, scan.image)
+        if (uneven_db := unevenness(scan.image, (across, down), pixels)) is not None:
+            self._uneven_db.append(uneven_db)
+
+    def _begun(self, scan: PlacedScan) -> Tally:
+        """A tally on a grid over all that is planned, or with room around a B-scan."""
+        height, step = scan.image.shape[0], np.full(3, LIVE.step_mm)
+        array, down = scan.world_from_pixel[:3, :2].T
+        down_mm = float(np.linalg.norm(down))
+        first_mm, last_mm = ((row - self.face_row) * down_mm for row in (insonation.top_row(self.face_row, down_mm), height - 1))
         if self.skin is None:
-            grid = insonation.widened(volume_compounding.grid_over(scan.corners, directions, step), ROOM)
-        else:
-            surface = np.asarray(self.skin.vertices, float)
-            grid = volume_compounding.grid_over(np.concatenate([surface, surface + self._depth_mm * y]), directions, step)
-        self.tally = insonation.begin(grid, scan.image.shape, self.spread, self.face_row)
-        if self.skin is not None:
-            places = insonation.centres(grid)
-            depths = containment.below(places.reshape(-1, 3), self.skin)[0].reshape(places.shape[:3])
-            self._planned = np.where((depths >= 0) & (depths <= self._depth_mm), depths, np.nan).astype(np.float32)
+            around = volume_compounding.grid_over(scan.corners, _directions(array, down), step)
+            return insonation.begin(insonation.widened(around, ROOM), scan.image.shape, self.spread, self.face_row)
+        inwards, surface = _inwards(self.skin), np.asarray(self.skin.vertices, float)
+        points = np.concatenate([surface, surface + last_mm * inwards])
+        directions = _directions(array, inwards)
+        grid = volume_compounding.grid_over(points, directions, step, insonation.LIMITS.around_mm)
+        tally = insonation.begin(grid, scan.image.shape, self.spread, self.face_row)
+        places = insonation.centres(grid)
+        depths = containment.below(places.reshape(-1, 3), self.skin)[0].reshape(places.shape[:3])
+        under = np.where((depths >= 0) & (depths <= last_mm), depths, np.nan).astype(np.float32)
+        ends = np.minimum(under - first_mm, last_mm - under) - LIVE.step_mm / 2  # wherever in its voxel a middle lies
+        self._planned = Planned(under, ends.astype(np.float32))
+        return tally
+
+
+def unevenness(image: NDArray[np.uint8], pixel_mm: tuple[float, float], pixels: Mask) -> float | None:
+    """Standard deviation, dB, of the tissue's power in a B-scan (h, w); None where it shows too little.
+
+    As `recon.segmentation.rough_bodies.rough` has it of many B-scans: of power smoothed over speckle, over that of the tissue
+    around, without dark bodies and robust against others.
+
+    pixels : (h, w) bool, that show tissue
+    """
+    limits, least = rough_bodies.LIMITS, 0.3  # share of the image
+    if pixels.mean() < least:
+        return None
+    power = cv2.LUT(image, echo_power.powers(float(np.median(image[::4, ::4][pixels[::4, ::4]])))) * pixels
+    size = tuple(max(1, round(n * mm / LIVE.pixel_mm)) for n, mm in zip(image.shape[::-1], pixel_mm, strict=True))
+    power, tissue = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (power, pixels.astype(np.float32)))
+
+    def mean(weight: Map, values: Map, sigma_mm: float) -> Map:
+        sums, shares = (cv2.GaussianBlur(one, (0, 0), sigma_mm / LIVE.pixel_mm) for one in (values * weight, weight))
+        return sums / np.maximum(shares, np.float32(1e-6))
+
+    local = power / np.maximum(tissue, np.float32(1e-6))
+    fine, kept, level = mean(tissue, local, limits.smooth_mm), tissue, np.float32(0)
+    for _ in range(2):
+        level = mean(kept, np.minimum(local, 2), limits.around_mm)
+        kept = tissue * (fine > limits.dark * level)
+    known = (kept > 0) & (level > 0)
+    if not known.any():
+        return None
+    spread = 1.4826 * float(np.median(np.abs(10 * np.log10(fine[known] / level[known]))))
+    return float(np.sqrt(max(spread**2 - LIVE.speckle_db**2, 0)))
+
+
+def _inwards(skin: trimesh.Trimesh) -> Array:
+    """Mean direction : (3,) into the body of a skin, whichever way its triangles are wound: away from camera 1."""
+    normals, places = np.asarray(skin.face_normals), np.asarray(skin.triangles_center)
+    away = np.sign((normals * places).sum(axis=1)) * skin.area_faces
+    total = away @ normals
+    return total / np.linalg.norm(total)
+
+
+def _directions(array: Array, beam: Array) -> Array:
+    """A grid's directions : (3, 3), columns, y along the beam and x along the array as far as that is square to it."""
+    y = beam / np.linalg.norm(beam)
+    x = array / np.linalg.norm(array)
+    least = 0.1  # of it across the beam
+    x = x - y * (x @ y) if np.linalg.norm(x - y * (x @ y)) > least else np.linalg.svd(y[None])[2][1]
+    x = x / np.linalg.norm(x)
+    return np.column_stack([x, y, np.cross(x, y)])
 
 
 def _holding(tally: Tally, corners: Array) -> Tally:
-    """A tally on a grid that holds a B-scan's corners : (4, 3) mm, and what lies beside."""
+    """A tally on a grid that holds a B-scan's corners : (4, 3) mm, and what lies beside; InputError if that is too large."""
     beside = np.array([1, 0, 1]) * insonation.LIMITS.around_mm / LIVE.step_mm + 1
-    while True:
-        index = rigid.apply(np.linalg.inv(insonation.world_from_voxel(tally.grid)), corners)
-        out = (index.min(axis=0) < beside) | (index.max(axis=0) > np.array(tally.grid.size) - 1 - beside)
-        if not out.any():
-            return tally
-        tally = insonation.grown(tally, tuple(np.where(out, ROOM, 0).tolist()))
+    index = rigid.apply(np.linalg.inv(insonation.world_from_voxel(tally.grid)), corners)
+    out = np.maximum(beside - index.min(axis=0), index.max(axis=0) - (np.array(tally.grid.size) - 1 - beside))
+    more = np.ceil(np.maximum(out, 0) / ROOM).astype(int) * ROOM
+    return insonation.grown(tally, tuple(more.tolist())) if more.any() else tally
 
 
 @dataclass
 class Mapper:
-    """A thread that adds B-scans to a running map; `newest` is what was seen so far."""
+    """A thread that adds B-scans to a running map; `newest` is what was seen so far, None once it has ended by a fault."""
 
     running: RunningMap
     newest: SeenSoFar | None = field(default=None, init=False)
@@ -137,8 +206,9 @@ class Mapper:
     _thread: Thread | None = field(default=None, init=False)
 
     def add(self, scan: PlacedScan) -> None:
-        """Leave a B-scan to be added."""
-        self._scans.put(scan)
+        """Leave a B-scan to be added; none once the thread has ended."""
+        if self._thread is None or self._thread.is_alive():
+            self._scans.put(scan)
 
     def start(self) -> None:
         """Begin."""
@@ -153,17 +223,17 @@ class Mapper:
             self._thread.join()
 
     def _run(self) -> None:
-        made, changed = -np.inf, False
+        made, changed, whole = -np.inf, False, False
         try:
-            while True:
+            while not whole:
                 scan = self._scans.take(LIVE.wait_s)
                 if scan is not None:
                     self.running.add(scan)
                     changed = True
                 if changed and (scan is None or monotonic() - made > LIVE.every_s):
                     self.newest, made, changed = self.running.seen(), monotonic(), False
-                if scan is None and self._ended:
-                    return
-        except InputError as error:  # navigation goes on without
-            self.newest = None
-            log.warning("what was seen isn't mapped any more: %s", error)
+                whole = scan is None and self._ended
+        finally:
+            if not whole:  # a fault, which Python tells; navigation goes on without
+                self.newest, self._scans = None, Every()
+                log.error("what was seen isn't mapped any more")

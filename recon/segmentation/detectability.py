@@ -5,10 +5,11 @@ independent cells as fit into the part of the body that was seen (Smith et al. 1
 contrast/detail analysis in medical ultrasound*; Wagner et al. 1983, *Statistics of speckle in ultrasound B-scans*), and the
 tissue's own unevenness, which doesn't average away within a lobule. A body is measured if all of it was seen, and if it is
 larger than the blur. A logistic function of these features makes a probability of them, with coefficients that `fit` finds from
-trials.
+trials: one set for even tissue, where masses are found by their contrast, and another for grown tissue, where a network tells
+them by their looks.
 """
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from recon import arguments
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.segmentation.insonation import Insonation, world_from_voxel
+from recon.segmentation.mass_network import Looks
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -60,25 +62,23 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibration:
-    """Coefficients of the features' sum, whose logistic function is the probability: assumed ones, to be fitted from trials."""
+    """Coefficients of the features' sum, whose logistic function is the probability."""
 
     constant: float = -9.5
     detectability: float = 3.0  # >= 0
     resolved: float = 1.5  # >= 0
     unseen: float = -25.0  # <= 0: with a tenth unseen a body counts as cut
     bright: float = -1.0
+    trials: int = 0  # that they were fitted to; 0 of assumed ones
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """The constant, and a coefficient a feature."""
+        return self.constant, self.detectability, self.resolved, self.unseen, self.bright
 
 
-ASSUMED = Calibration()
+EVEN, GROWN = Calibration(), Calibration()  # of masses that are found by their contrast, and by their looks
 BOUNDS = ((None, None), (0, None), (0, None), (None, 0), (None, None))  # of the coefficients: a better view never harms
-
-
-class Reliability(NamedTuple):
-    """Predicted against observed, a row a bin of probability that has trials."""
-
-    predicted: Array  # mean probability
-    observed: Array  # share that was found
-    trials: NDArray[np.int64]
 
 
 class Ball(NamedTuple):
@@ -179,9 +179,19 @@ def features_at(
     return Features(*made)
 
 
-def probability(given: Features, calibration: Calibration = ASSUMED) -> Array:
+def calibration_for(uneven_db: float, looks: Looks | None = None) -> Calibration:
+    """Coefficients of the observer that looks for masses in tissue whose power has a standard deviation."""
+    return GROWN if (looks or Looks()).sees(uneven_db) else EVEN
+
+
+def source(trials: int) -> str:
+    """Origin of coefficients, for people."""
+    return f"by coefficients fitted to {trials} trials" if trials else "by assumed coefficients"
+
+
+def probability(given: Features, calibration: Calibration = EVEN) -> Array:
     """Probability that a mass is found whole and measured."""
-    constant, *slopes = astuple(calibration)
+    constant, *slopes = calibration.coefficients
     return expit(constant + sum(slope * one for slope, one in zip(slopes, given, strict=True)))
 
 
@@ -219,22 +229,4 @@ def fit(given: Features, found: ArrayLike, ridge: float = 1e-3) -> Calibration:
 
     found_at = minimize(misfit, np.zeros(design.shape[1]), jac=True, method="L-BFGS-B", bounds=BOUNDS, options={"maxiter": 2000})
     slopes = found_at.x[1:] / scale * used
-    return Calibration(float(found_at.x[0] - slopes @ middle), *slopes.tolist())
-
-
-def reliability(predicted: ArrayLike, found: ArrayLike, bins: int = 10) -> Reliability:
-    """Predicted probabilities : (n,) against the share that was found, in bins of equal width.
-
-    Raises
-    ------
-    InputError
-        If there is no trial, or a number isn't a probability.
-    """
-    share, hit = np.ravel(predicted).astype(float), np.ravel(found).astype(float)
-    if not len(share) or share.shape != hit.shape or not ((share >= 0) & (share <= 1)).all():
-        raise InputError(f"trials: expected probabilities from 0 to 1, and as many outcomes, found {len(share)} and {len(hit)}")
-    number = np.minimum((share * bins).astype(int), bins - 1)
-    trials = np.bincount(number, minlength=bins)
-    kept = trials > 0
-    mean, observed = (np.bincount(number, one, bins)[kept] / trials[kept] for one in (share, hit))
-    return Reliability(mean, observed, trials[kept])
+    return Calibration(float(found_at.x[0] - slopes @ middle), *slopes.tolist(), trials=len(hit))

@@ -4,12 +4,13 @@ A tally takes B-scans one by one, in any order, and holds sums and extremes alon
 memory on the number of voxels only. On the grid along the mean array (x) and beam (y) and across both (z) it keeps sums in voxels
 of some 2 mm, and marks in parts of these whether a B-scan passed.
 
-A line of the array counts down to its last bright echo. Where it has none it doesn't touch the skin; what is dark to the image's
-lower end lies behind the tissue, or in a deep shadow.
+A line of the array counts where it shows tissue: down to its last bright echo, without what is dark for longer than a mass is
+deep, which is a shadow, and without what is black from the image's upper border or its sides on, which lies beside a fan or under
+a line that doesn't touch the skin.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import repeat
 from typing import NamedTuple
@@ -54,7 +55,9 @@ class SeeingLimits:
         10.0  # beside the scanned hull, that is still to be scanned; strokes less than twice that apart are one hull
     )
     block_mm: float = 2.0  # of a B-scan, over which speckle is averaged before it counts as bright or dark
-    bright: float = 0.5  # of the typical grey level in the image's upper half
+    drop_db: float = 8.0  # below the typical level in the image's upper half: what is darker is a mass, a shadow or noise
+    dark_mm: float = 12.0  # down a line, beyond which what is dark counts as a shadow
+    black_mm: float = 1.0  # of black between echoes, that is speckle's
     least_grey: float = 5.0  # of 255, of tissue, at least
     most_voxels: int = 4_000_000  # half a GB
 
@@ -88,9 +91,8 @@ class Sums(NamedTuple):
 class Shown(NamedTuple):
     """The part of a B-scan that shows tissue."""
 
-    width: int  # px
+    pixels: Mask  # (h, w)
     top: int  # first row below the ringing
-    deepest: Array  # (blocks,) last row of a line that shows tissue, in blocks along the array; -1 of none
     face_row: float  # from which depths count
     down_mm: float  # height of a pixel
     variance: Array  # (h,) mm^2 across the plane, of each row
@@ -104,36 +106,82 @@ class Tally:
     shape: tuple[int, int]  # h, w of the B-scans
     spread: Spread
     face_row: float
+    dynamic_range_db: float  # from black to white
     sums: Sums
     marks: NDArray[np.uint8]  # (nz, ny, nx) times PARTS: whether a B-scan passed
 
 
+class Planned(NamedTuple):
+    """All that is to be scanned, in place of what was: (nz, ny, nx) mm."""
+
+    under_mm: Map  # depth below the skin; NaN elsewhere
+    room_mm: Map  # from skin, ringing and the images' lower end, whichever is nearest
+
+
 @dataclass(frozen=True, eq=False)
 class Insonation:
-    """How each place was seen: (nz, ny, nx) float32 on a grid, x along the array, y into the depth, z across."""
+    """How each place was seen: (nz, ny, nx) float32 on the tally's grid, x along the array, y into the depth, z across."""
 
-    grid: Grid
-    count: Map  # B-scans through the voxel
-    depth_mm: Map  # below the face, mean; NaN without a B-scan
-    beam: Map  # (nz, ny, nx, 3) mean direction of the beam in the world, a unit vector; NaN without
-    turned_deg: Map  # standard deviation of that direction; NaN without
-    axial_mm: Map  # sigma of an echo's power in depth
-    lateral_mm: Map  # the same across the beam where it is finest
-    elevational_mm: Map  # and where it is coarsest, with the B-scans' spacing; infinite far from any
+    tally: Tally
+    elevational_mm: Map  # sigma of an echo's power across the beam where it is coarsest, by the B-scans' spacing, too
     gap_mm: Map  # width of the widest gap between B-scans in the voxel: 0 where there is none, infinite beside the scan
     seen: Map  # share of the voxel that was seen, gaps that masses are found across included
     cells: Map  # independent cells of speckle a mm^3
     under_mm: Map  # depth below the skin, negative above; from the array's face where there is no skin over it
+    room_mm: Map  # from skin, ringing and the images' lower end, whichever is nearest: radius of a ball that can be seen whole
     hull: Mask  # what was scanned, with what lies between
     around: Mask  # that, and what lies beside it under the skin
+
+    @property
+    def grid(self) -> Grid:
+        """The voxels."""
+        return self.tally.grid
 
     @property
     def voxel_mm3(self) -> float:
         """Volume of a voxel."""
         return float(np.prod(self.grid.spacing))
 
+    @property
+    def count(self) -> Map:
+        """B-scans through a voxel."""
+        return self.tally.sums.count
 
-def begin(grid: Grid, shape: tuple[int, int], spread: Spread | None = None, face_row: float = 0.0) -> Tally:
+    @property
+    def depth_mm(self) -> Map:
+        """Mean depth below the face; NaN without a B-scan."""
+        return _mean(self.tally.sums.depth, self.count)
+
+    @property
+    def beam(self) -> Map:
+        """Mean direction of the beam in the world, a unit vector : (nz, ny, nx, 3); NaN without a B-scan."""
+        beam = self.tally.sums.beam
+        return _mean(beam, np.linalg.norm(beam, axis=-1)[..., None])
+
+    @property
+    def turned_deg(self) -> Map:
+        """Standard deviation of that direction; NaN without a B-scan."""
+        length = _mean(np.linalg.norm(self.tally.sums.beam, axis=-1), self.count)
+        return np.rad2deg(np.sqrt(np.maximum(2 * (1 - length), 0)))
+
+    @property
+    def axial_mm(self) -> float:
+        """Sigma of an echo's power in depth."""
+        return self.tally.spread.axial_mm
+
+    @property
+    def lateral_mm(self) -> Map:
+        """The same across the beam where it is finest; infinite far from any B-scan."""
+        return np.sqrt(np.minimum.reduce(list(_variances(self.tally))))
+
+
+def begin(
+    grid: Grid,
+    shape: tuple[int, int],
+    spread: Spread | None = None,
+    face_row: float = 0.0,
+    dynamic_range_db: float = 60.0,
+) -> Tally:
     """A tally without B-scans; shape (h, w) of those to come.
 
     Raises
@@ -150,7 +198,7 @@ def begin(grid: Grid, shape: tuple[int, int], spread: Spread | None = None, face
     count, depth, beam, density = (np.zeros(one, np.float32) for one in (size, size, (*size, 3), families))
     sums = Sums(count, depth, beam, density, np.full(families, np.inf, np.float32))
     marks = np.zeros(np.multiply(size, PARTS), np.uint8)
-    return Tally(grid, shape, spread or Spread(), face_row, sums, marks)
+    return Tally(grid, shape, spread or Spread(), face_row, dynamic_range_db, sums, marks)
 
 
 def grid_around(world_from_pixel: Array, shape: tuple[int, int], step_mm: float = LIMITS.step_mm) -> Grid:
@@ -175,7 +223,7 @@ def widened(grid: Grid, more: tuple[int, int, int]) -> Grid:
 
 def grown(tally: Tally, more: tuple[int, int, int]) -> Tally:
     """The same tally on a grid with some voxels more at both ends of x, y and z; InputError if these are too many."""
-    larger = begin(widened(tally.grid, more), tally.shape, tally.spread, tally.face_row)
+    larger = begin(widened(tally.grid, more), tally.shape, tally.spread, tally.face_row, tally.dynamic_range_db)
     (z, y, x), (nz, ny, nx) = more[::-1], tally.grid.size[::-1]
     inner = slice(z, z + nz), slice(y, y + ny), slice(x, x + nx)
     for name, one in zip(Sums._fields, tally.sums, strict=True):
@@ -184,28 +232,73 @@ def grown(tally: Tally, more: tuple[int, int, int]) -> Tally:
     return larger
 
 
-def tissue_rows(image: NDArray[np.uint8], pixel_mm: tuple[float, float]) -> Array:
-    """Last row : (blocks,) that shows tissue, in blocks along the array of a B-scan (h, w); -1 where none does."""
-    height, width = image.shape
+def top_row(face_row: float, down_mm: float) -> int:
+    """First row of images below the ringing at the face."""
+    return max(0, math.ceil(face_row + LIMITS.ringing_mm / down_mm - 1e-6))
+
+
+def tissue(
+    image: NDArray[np.uint8], pixel_mm: tuple[float, float], face_row: float = 0.0, dynamic_range_db: float = 60.0
+) -> Mask:
+    """Pixels : (h, w) below the ringing that show tissue in a B-scan (h, w) whose grey levels are log-compressed.
+
+    pixel_mm : width and height of a pixel
+    """
+    (height, width), top = image.shape, top_row(face_row, pixel_mm[1])
+    echoes = ~_black(image, pixel_mm)
     size = tuple(max(1, round(n * mm / LIMITS.block_mm)) for n, mm in ((width, pixel_mm[0]), (height, pixel_mm[1])))
-    blocks = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    typical = float(np.median(blocks[: max(1, len(blocks) // 2)]))
-    bright = blocks >= max(LIMITS.least_grey, LIMITS.bright * typical)
-    last = len(blocks) - np.argmax(bright[::-1], axis=0)
-    return np.where(bright.any(axis=0), last * height / len(blocks) - 1, -1.0)
+    sums, shares = (cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in (image, np.uint8(255) * echoes))
+    blocks = sums / np.maximum(shares / 255, 1 / 255)
+    first, count = min(top * len(blocks) // height, len(blocks) - 1), len(blocks)
+    upper = blocks[first : max(first + 1, count // 2)]
+    if not (upper >= LIMITS.least_grey).any():
+        return np.zeros(image.shape, bool)
+    typical = float(np.median(upper[upper >= LIMITS.least_grey]))
+    bright = blocks >= max(LIMITS.least_grey, typical - LIMITS.drop_db * 255 / dynamic_range_db)
+    row = np.arange(count)[:, None]
+    before = np.maximum.accumulate(np.where(bright, row, first - 1))
+    after = np.minimum.accumulate(np.where(bright, row, count)[::-1])[::-1]
+    dark_mm = (after - before - 2) * height * pixel_mm[1] / count  # its ends lie within blocks
+    shown = bright | ((after < count) & (dark_mm <= LIMITS.dark_mm))
+    rows, columns = (np.arange(n) * blocks // n for n, blocks in ((height, size[1]), (width, size[0])))
+    pixels = shown[rows][:, columns] & echoes
+    pixels[:top] = False
+    return pixels
+
+
+def _black(image: NDArray[np.uint8], pixel_mm: tuple[float, float]) -> Mask:
+    """Pixels : (h, w) that are black, with all between them and the image's upper border or its sides."""
+    size = tuple(2 * max(1, round(LIMITS.black_mm / mm / 2)) + 1 for mm in pixel_mm)
+    closed = cv2.morphologyEx((image > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones(size[::-1], np.uint8))
+    dark = np.asarray(closed) == 0
+    count, labels = cv2.connectedComponents(dark.astype(np.uint8), connectivity=4)
+    outer = np.zeros(count, bool)
+    outer[np.concatenate([labels[0], labels[:, 0], labels[:, -1]])] = True
+    outer[0] = False  # what isn't dark
+    return outer[labels]
 
 
 def add(tally: Tally, world_from_pixel: Array, image: NDArray[np.uint8] | None = None) -> None:
-    """Take in a B-scan (h, w) at a pose : (4, 4); one of NaN is left out. Without an image all of it counts as tissue."""
+    """Take in a B-scan (h, w) at a pose : (4, 4); one of NaN is left out. Without an image all of it counts as tissue.
+
+    Raises
+    ------
+    InputError
+        If the image has another size or isn't grey.
+    """
+    if image is not None:
+        check(image, tally.shape)
     if not np.isfinite(world_from_pixel).all():
         return
     height, width = tally.shape
     across_mm, down_mm = np.linalg.norm(world_from_pixel[:3, :2], axis=0).tolist()
     plane, x, y = np.eye(4), *world_from_pixel[:3, :2].T
     plane[:3] = np.column_stack([x, y, np.cross(x, y) / np.linalg.norm(np.cross(x, y)), world_from_pixel[:3, 3]])
-    deepest = np.full(1, height - 1.0) if image is None else tissue_rows(image, (across_mm, down_mm))
+    pixels = np.ones(tally.shape, bool)
+    if image is not None:
+        pixels = tissue(image, (across_mm, down_mm), tally.face_row, tally.dynamic_range_db)
     variance = tally.spread.across((np.arange(height) - tally.face_row) * down_mm) ** 2
-    shown = Shown(width, int(np.ceil(LIMITS.ringing_mm / down_mm - 1e-6)), deepest, tally.face_row, down_mm, variance)
+    shown = Shown(pixels, top_row(tally.face_row, down_mm), tally.face_row, down_mm, variance)
     corners = np.array([[u, v, d] for u in (-0.5, width - 0.5) for v in (-0.5, height - 0.5) for d in (-1, 1)], float)
     along = plane[:3, 2] @ tally.grid.directions
     family = round(math.atan2(along[0], along[2]) / (math.pi / FAMILIES)) % FAMILIES
@@ -225,6 +318,13 @@ def add(tally: Tally, world_from_pixel: Array, image: NDArray[np.uint8] | None =
             _sum(tally.sums, pixel_from_place, half, reach, box, shown, family, beam)
 
 
+def check(image: NDArray, shape: tuple[int, ...]) -> None:
+    """Refuse an image of another size than (h, w), or one that isn't of 8-bit grey: InputError."""
+    if image.shape != shape or image.ndim != 2 or image.dtype != np.uint8:
+        wanted, found = ("x".join(map(str, (*one[1::-1], *one[2:]))) for one in (shape, image.shape))
+        raise InputError(f"image: expected {wanted} px of 8-bit grey, found {found} of {image.dtype}")
+
+
 def of_sweep(
     world_from_pixel: Array,
     shape: tuple[int, int],
@@ -233,6 +333,7 @@ def of_sweep(
     spread: Spread | None = None,
     face_row: float = 0.0,
     step_mm: float = LIMITS.step_mm,
+    dynamic_range_db: float = 60.0,
 ) -> Insonation:
     """How each place in and beside a sweep was seen.
 
@@ -248,11 +349,13 @@ def of_sweep(
     Raises
     ------
     InputError
-        If no B-scan has a pose, arrays point all round, the grid is too large, or there are more or fewer images than poses.
+        If no B-scan has a pose, arrays point all round, the grid is too large, there are more or fewer images than poses, or one
+        has another size.
     """
     world_from_pixel = arguments.places_of_pixels("world_from_pixel", world_from_pixel)
     height, width = arguments.image_size("shape", shape, "height and width")
-    tally = begin(grid_around(world_from_pixel, (height, width), step_mm), (height, width), spread, face_row)
+    grid = grid_around(world_from_pixel, (height, width), step_mm)
+    tally = begin(grid, (height, width), spread, face_row, dynamic_range_db)
     left = iter(world_from_pixel)
     for image in repeat(None, len(world_from_pixel)) if images is None else images:
         if (matrix := next(left, None)) is None:
@@ -263,58 +366,47 @@ def of_sweep(
     return insonation(tally, skin)
 
 
-def insonation(tally: Tally, skin: trimesh.Trimesh | None = None, planned: Map | None = None) -> Insonation:
+def insonation(tally: Tally, skin: trimesh.Trimesh | None = None, planned: Planned | None = None) -> Insonation:
     """How each place was seen so far.
 
     Parameters
     ----------
     skin : as measured by light
-    planned : (nz, ny, nx) mm
-        Depths below the skin of all that is to be scanned, and NaN elsewhere; in place of the hull of what was scanned.
+    planned : in place of the hull of what was scanned
     """
-    sums, grid, spread = tally.sums, tally.grid, tally.spread
+    sums, spread = tally.sums, tally.spread
     gap_mm, seen = _gaps(tally)
-    count, lateral = sums.count, spread.lateral_mm
-    known = count > 0
-    times = np.where(known, count, np.float32(np.nan))
-    length = np.linalg.norm(sums.beam, axis=-1)
-    mean = sums.beam / np.where(known, length, np.float32(np.nan))[..., None]
-    turned = np.rad2deg(np.sqrt(np.maximum(2 * (1 - length / times), 0)))
     cell = 2 * np.sqrt(np.pi)  # correlation length of speckle over sigma of power: Wagner et al. 1983, for a Gaussian
+    with np.errstate(divide="ignore"):
+        finest = 1 / (cell * np.sqrt(sums.variance))
+    cells = np.minimum(sums.density, finest).sum(axis=0) / (cell**2 * spread.lateral_mm * spread.axial_mm)
+    elevational = np.sqrt(np.maximum.reduce(list(_variances(tally))))
+    if planned is None:
+        under, room, hull, around = _scanned(tally, skin)
+    else:
+        hull = around = np.isfinite(planned.under_mm)
+        under, room = (np.where(hull, one, np.float32(-1)) for one in planned)
+    return Insonation(tally, elevational, gap_mm, seen, (cells * seen).astype(np.float32), under, room, hull, around)
+
+
+def _mean(total: Map, count: Map) -> Map:
+    """A sum over a count; NaN where that is 0."""
+    return total / np.where(count > 0, count, np.float32(np.nan))
+
+
+def _variances(tally: Tally) -> Iterator[Map]:
+    """Variances of an echo's power : (nz, ny, nx) mm^2 in each of DIRECTIONS across the beam, by the best family of planes."""
+    sums, lateral = tally.sums, np.float32(tally.spread.lateral_mm**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         spaced = (1 / sums.density) ** 2 / 12 + sums.variance  # an even spread between planes
-        finest = 1 / (cell * np.sqrt(sums.variance))
     angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
     within = np.cos(angles[:, None] - np.arange(FAMILIES) * np.pi / FAMILIES) ** 2
-    worst, best = np.zeros(count.shape, np.float32), np.full(count.shape, np.inf, np.float32)
     for shares in within.astype(np.float32):
-        one = np.full(count.shape, np.inf, np.float32)
+        one = np.full(sums.count.shape, np.inf, np.float32)
         for share, variance in zip(shares, spaced, strict=True):
             near = np.isfinite(variance)
-            one[near] = np.minimum(one[near], (share * variance + (1 - share) * np.float32(lateral**2))[near])
-        worst, best = np.maximum(worst, one), np.minimum(best, one)
-    cells = np.minimum(sums.density, finest).sum(axis=0) / (cell**2 * lateral * spread.axial_mm)
-    if planned is None:
-        under, hull, around = _scanned(tally, skin)
-    else:
-        under, hull = np.nan_to_num(planned, nan=-1.0), np.isfinite(planned)
-        around = hull
-    return Insonation(
-        grid,
-        count,
-        sums.depth / times,
-        mean,
-        turned,
-        np.full(count.shape, spread.axial_mm, np.float32),
-        np.sqrt(best),
-        np.sqrt(worst),
-        gap_mm,
-        seen,
-        (cells * seen).astype(np.float32),
-        under.astype(np.float32),
-        hull,
-        around,
-    )
+            one[near] = np.minimum(one[near], (share * variance + (1 - share) * lateral)[near])
+        yield one
 
 
 def centres(grid: Grid) -> Array:
@@ -323,13 +415,13 @@ def centres(grid: Grid) -> Array:
     return rigid.apply(world_from_voxel(grid), np.stack([i, j, k], axis=-1).astype(float))
 
 
-def _scanned(tally: Tally, skin: trimesh.Trimesh | None) -> tuple[Map, Mask, Mask]:
-    """Depths : mm below skin or face, what was scanned with what lies between, and that with what lies beside."""
+def _scanned(tally: Tally, skin: trimesh.Trimesh | None) -> tuple[Map, Map, Mask, Mask]:
+    """Depths : mm below skin or face, room there, what was scanned with what lies between, and that with what lies beside."""
     step, known = float(tally.grid.spacing[1]), tally.sums.count > 0
     footprint = known.any(axis=1)
     if not footprint.any():
         none = np.zeros(known.shape, bool)
-        return np.full(known.shape, -1, np.float32), none, none
+        return np.full(known.shape, -1, np.float32), np.full(known.shape, -1, np.float32), none, none
     pad = int(np.ceil(2 * LIMITS.around_mm / tally.grid.spacing[[0, 2]].min())) + 1
     sides, wide = tally.grid.spacing[[2, 0]], np.pad(footprint, pad)
     near = np.asarray(ndimage.distance_transform_edt(~wide, sides)) <= LIMITS.around_mm
@@ -340,9 +432,9 @@ def _scanned(tally: Tally, skin: trimesh.Trimesh | None) -> tuple[Map, Mask, Mas
     at = np.asarray(ndimage.distance_transform_edt(~core, sides, return_distances=False, return_indices=True))
     at = tuple(np.where(footprint, np.indices(footprint.shape), at))
     first, last = known.argmax(axis=1)[at], (known.shape[1] - 1 - known[:, ::-1].argmax(axis=1))[at]
-    row = np.arange(known.shape[1])[:, None]
-    face = first[:, None] * step - step / 2 - LIMITS.ringing_mm
-    under = np.broadcast_to(row * step - face, known.shape).astype(np.float32)
+    row, depth = np.arange(known.shape[1])[:, None], _mean(tally.sums.depth, tally.sums.count)
+    begins = depth[at[0], first, at[1]] - first * step  # depth of the grid's first row below the face
+    under = (row * step + begins[:, None]).astype(np.float32)
     column = near[inner][:, None] & (under >= 0) & (row <= last[:, None])
     if skin is not None:
         places = np.argwhere(near[inner][:, None] & (row <= last[:, None]))
@@ -350,7 +442,8 @@ def _scanned(tally: Tally, skin: trimesh.Trimesh | None) -> tuple[Map, Mask, Mas
         k, j, i = places[np.isfinite(depths)].T
         under[k, j, i] = depths[np.isfinite(depths)]
         column = near[inner][:, None] & (under >= 0) & (row <= last[:, None])
-    return under, column & closed[inner][:, None], column
+    room = np.minimum(under, np.minimum(row - first[:, None], last[:, None] - row) * np.float32(step))
+    return under, room, column & closed[inner][:, None], column
 
 
 def world_from_voxel(grid: Grid) -> Array:
@@ -388,10 +481,10 @@ def _place(m, i, j, k):
 @njit(inline="always")
 def _shows(shown, u, v):
     """Whether a B-scan shows tissue at a pixel."""
-    share = (u + 0.5) / shown.width
-    if not (0 <= share < 1 and v >= shown.top):
+    height, width = shown.pixels.shape
+    if not (-0.5 <= u < width - 0.5 and shown.top <= v < height - 0.5):
         return False
-    return v <= shown.deepest[int(share * shown.deepest.size)] + 0.5
+    return shown.pixels[int(v + 0.5), int(u + 0.5)]
 
 
 @kernel

@@ -4,11 +4,12 @@ import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 from skimage.measure import marching_cubes
 
 from recon.errors import validated
@@ -19,8 +20,9 @@ from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.part import Fraction, NotNegative, Part, Positive
 from recon.segmentation import detectability, insonation
-from recon.segmentation.detectability import ASSUMED, OBSERVER, Calibration, Sought
+from recon.segmentation.detectability import OBSERVER, Calibration, Sought
 from recon.segmentation.insonation import Insonation, Spread
+from recon.segmentation.mass_network import Looks
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -29,6 +31,28 @@ Mask = NDArray[np.bool_]
 VOLUME, SURFACE, TABLE = "seen.nrrd", "unseen.ply", "seen.json"  # files
 SIZES_MM, CONTRASTS_DB = (4.0, 6.0, 8.0, 12.0, 20.0), (2.5, 5.0, 8.0, 15.0)  # of the table
 WELL, POORLY = 0.9, 0.5  # probability from which a place counts as seen, and below which it counts as unseen
+OUTSIDE = -1  # in the volume's file: where the mass has no room, and beside what is to be scanned
+
+
+class Insonified(Part):
+    """How a scanned volume was insonified: medians of its voxels with a B-scan."""
+
+    depth_mm: float
+    """below the array's face"""
+    under_mm: float
+    """below the skin, or the face without one"""
+    beam: tuple[float, float, float]
+    """direction of the sound in the world, a unit vector"""
+    turned_deg: NotNegative
+    """standard deviation of that direction at a place"""
+    axial_mm: NotNegative
+    """sigma of an echo's power in depth"""
+    lateral_mm: NotNegative
+    """likewise across the beam where it is finest"""
+    elevational_mm: NotNegative
+    """likewise where it is coarsest"""
+    gap_mm: NotNegative | None
+    """widest gap between B-scans in a voxel; null where most lie beside what was scanned"""
 
 
 class Table(Part):
@@ -40,8 +64,25 @@ class Table(Part):
     """of it"""
     sizes_mm: tuple[Positive, ...] = SIZES_MM
     contrasts_db: tuple[NotNegative, ...] = CONTRASTS_DB
-    shares: tuple[tuple[Fraction, ...], ...] = Field(default=())
+    shares: tuple[tuple[Fraction, ...], ...]
     """a row a size, a column a contrast"""
+    trials: Annotated[int, Field(ge=0)] = 0
+    """that the coefficients were fitted to; 0 of assumed ones"""
+    insonified: Insonified | None = None
+    """null where nothing was"""
+
+    @model_validator(mode="after")
+    def _whole(self) -> "Table":
+        rows, columns = len(self.sizes_mm), len(self.contrasts_db)
+        if [len(row) for row in self.shares] != rows * [columns]:
+            found = f"{len(self.shares)} with {', '.join(str(len(row)) for row in self.shares) or 'none'}"
+            raise ValueError(f"shares: expected {rows} rows with {columns} each, found {found}")
+        return self
+
+    @property
+    def source(self) -> str:
+        """Origin of the coefficients, for people."""
+        return detectability.source(self.trials)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +91,13 @@ class Seen:
 
     where: Insonation
     sought: Sought
-    probability: Map  # (nz, ny, nx); 0 where the mass has no room under the skin, and outside of what is to be scanned
+    probability: Map  # (nz, ny, nx); 0 outside of the planned volume
     table: Table
 
     @property
     def room(self) -> Mask:
-        """Places (nz, ny, nx) in and beside what was scanned where the mass has room under the skin."""
-        return self.where.around & roomy(self.where, self.sought.size_mm)
+        """The planned volume."""
+        return planned(self.where, self.sought.size_mm)
 
     @property
     def unseen(self) -> Mask:
@@ -78,13 +119,13 @@ class Seen:
         seen, unseen = (value / 1000 for value in self.figures.values())
         scanned = float((self.room & self.where.hull).sum()) * self.where.voxel_mm3 / 1000
         what = f"a mass of {self.sought.size_mm:g} mm and {self.sought.contrast_db:g} dB"
-        return f"seen        {seen:.0f} of {scanned:.0f} cm3 well enough for {what}; {unseen:.0f} cm3 not"
+        return f"seen        {seen:.0f} of {scanned:.0f} cm3 well enough for {what}, {self.table.source}; {unseen:.0f} cm3 not"
 
     @property
     def volume(self) -> Volume:
-        """The map as a volume."""
+        """The map as a volume, with OUTSIDE beside the planned one: 3D Slicer shows that as black, as NaN it may not."""
         grid = self.where.grid
-        return Volume(self.probability, grid.origin, grid.spacing, grid.directions)
+        return Volume(np.where(self.room, self.probability, np.float32(OUTSIDE)), grid.origin, grid.spacing, grid.directions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +137,18 @@ class SeenFiles:
     unseen: trimesh.Trimesh | None = None  # surface about what is still to be scanned
 
 
-def roomy(where: Insonation, size_mm: float) -> Mask:
-    """Places : (nz, ny, nx) where a ball of a diameter lies below the skin as a whole."""
-    return where.under_mm >= size_mm / 2
+def planned(where: Insonation, size_mm: float) -> Mask:
+    """Middles : (nz, ny, nx) of balls of a diameter that can be seen whole, in and beside what was scanned.
+
+    They lie under the skin, below the ringing and above the images' lower end, so that a perfect sweep shows all of them.
+    """
+    return where.around & (where.room_mm >= size_mm / 2)
 
 
-def probability(where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration = ASSUMED) -> Map:
+def probability(where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration | None = None) -> Map:
     """Probability : (nz, ny, nx) that a mass with its middle at each place is found, wherever that is."""
-    return next(_probabilities(where, sought.size_mm, [sought], uneven_db, calibration))
+    chosen = calibration or detectability.calibration_for(uneven_db)
+    return next(_probabilities(where, sought.size_mm, [sought], uneven_db, chosen))
 
 
 def _probabilities(
@@ -117,22 +162,44 @@ def _probabilities(
 
 
 def look(
-    where: Insonation, sought: Sought | None = None, uneven_db: float = OBSERVER.even_db, calibration: Calibration = ASSUMED
+    where: Insonation, sought: Sought | None = None, uneven_db: float = OBSERVER.even_db, calibration: Calibration | None = None
 ) -> Seen:
     """The map for a mass, by how each place was seen, and the table.
 
+    Parameters
+    ----------
     uneven_db : of the tissue's power, as of `recon.segmentation.masses.from_scans`
+    calibration : of the observer, by default the one for such tissue
     """
-    chosen = sought or Sought()
+    chosen, calibration = sought or Sought(), calibration or detectability.calibration_for(uneven_db)
     rows = []
     for size in SIZES_MM:
-        scanned = where.hull & roomy(where, size)
+        scanned = where.hull & planned(where, size)
         several = [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB]
         made = _probabilities(where, size, several, uneven_db, calibration)
         rows.append(tuple(float(one[scanned].mean()) if scanned.any() else 0.0 for one in made))
-    there = where.around & roomy(where, chosen.size_mm)
+    there = planned(where, chosen.size_mm)
     found = np.where(there, probability(where, chosen, uneven_db, calibration), np.float32(0))
-    return Seen(where, chosen, found, Table(size_mm=chosen.size_mm, contrast_db=chosen.contrast_db, shares=tuple(rows)))
+    table = Table(
+        size_mm=chosen.size_mm,
+        contrast_db=chosen.contrast_db,
+        shares=tuple(rows),
+        trials=calibration.trials,
+        insonified=insonified(where),
+    )
+    return Seen(where, chosen, found, table)
+
+
+def insonified(where: Insonation) -> Insonified | None:
+    """Medians of what was scanned; None where nothing was."""
+    there = where.hull & (where.count > 0)
+    if not there.any():
+        return None
+    names = "depth_mm", "under_mm", "turned_deg", "lateral_mm", "elevational_mm"
+    made = {name: float(np.median(getattr(where, name)[there])) for name in names}
+    beam, gap = np.median(where.beam[there], axis=0), float(np.median(where.gap_mm[there]))
+    x, y, z = (beam / np.linalg.norm(beam)).tolist()
+    return Insonified(beam=(x, y, z), axial_mm=where.axial_mm, gap_mm=gap if np.isfinite(gap) else None, **made)
 
 
 def of_scans(
@@ -141,11 +208,14 @@ def of_scans(
     spread: Spread | None = None,
     sought: Sought | None = None,
     uneven_db: float = OBSERVER.even_db,
+    dynamic_range_db: float = 60.0,
+    looks: Looks | None = None,
 ) -> Seen:
     """The map of a sweep's B-scans; see `look` and `recon.segmentation.insonation.of_sweep`, which raises InputError."""
     face_row = 0.0 if scans.probe is None else scans.probe.face_row
-    where = insonation.of_sweep(scans.world_from_pixel, scans.shape, scans.stream(), skin, spread, face_row)
-    return look(where, sought, uneven_db)
+    placed, images = (scans.world_from_pixel, scans.shape), scans.stream()
+    where = insonation.of_sweep(*placed, images, skin, spread, face_row, dynamic_range_db=dynamic_range_db)
+    return look(where, sought, uneven_db, detectability.calibration_for(uneven_db, looks))
 
 
 def unseen_surface(seen: Seen) -> trimesh.Trimesh | None:

@@ -164,7 +164,10 @@ def map_seen(found: Segmented, settings: Settings, skin: trimesh.Trimesh | None 
         return None
     uneven_db = found.figures.get("tissue_uneven_db", detectability.OBSERVER.even_db)
     with watch.busy("mapping what was seen"):
-        mapped = seen_map.of_scans(found.scans, skin, settings.spreads, settings.sought, uneven_db)
+        looks = Looks(settings.looks)
+        mapped = seen_map.of_scans(
+            found.scans, skin, settings.spreads, settings.sought, uneven_db, settings.dynamic_range_db, looks
+        )
     watch.say(mapped.line)
     return mapped
 

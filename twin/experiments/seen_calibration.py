@@ -1,7 +1,9 @@
 """Fit the probability that a mass is found to kept trials of `seen`, and test it on others: predicted against found.
 
-Trials of even seeds fit, those of odd seeds test, so that no breast does both. Intervals are of 95 %, exact binomial (Clopper and
-Pearson 1934), as if pairs were independent; those of one mass taken in several ways aren't, so they are somewhat too narrow.
+Four seeds fit, one of each density of breast, and the next four test, so that no breast does both. Pairs in even and in grown
+tissue are fitted apart, as masses are found there by their contrast and by their looks. Intervals are of 95 %, exact binomial
+(Clopper and Pearson 1934), as if pairs were independent; those of one mass taken in several ways aren't, so they are somewhat too
+narrow.
 
 python -m twin.experiments.seen_calibration outputs/seen outputs/seen_patients
 """
@@ -11,7 +13,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,8 @@ from scipy.stats import binomtest
 
 from recon.errors import InputError
 from recon.segmentation import detectability
-from recon.segmentation.detectability import ASSUMED, Calibration, Features
+from recon.segmentation.detectability import EVEN, GROWN, Calibration, Features
+from twin.experiments import patient_trial, seen_trial
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,24 +46,12 @@ class Outcomes:
     found: Mask  # (n,)
     seed: NDArray[np.int64]  # (n,)
     tissue: NDArray[np.str_]  # (n,)
+    uneven_db: Array  # (n,) of the tissue
 
     def of(self, chosen: Mask) -> "Outcomes":
         """Some of them."""
-        return Outcomes(
-            Features(*(one[chosen] for one in self.features)), self.found[chosen], self.seed[chosen], self.tissue[chosen]
-        )
-
-
-def calibrate(tables: Iterable[Table]) -> Calibration:
-    """Coefficients by the pairs of even seeds.
-
-    Raises
-    ------
-    InputError
-        As `recon.segmentation.detectability.fit`.
-    """
-    fitting, _ = halves(outcomes(tables))
-    return detectability.fit(fitting.features, fitting.found)
+        rest = (getattr(self, one.name)[chosen] for one in fields(self)[1:])
+        return Outcomes(Features(*(one[chosen] for one in self.features)), *rest)
 
 
 def outcomes(tables: Iterable[Table]) -> Outcomes:
@@ -76,38 +67,48 @@ def outcomes(tables: Iterable[Table]) -> Outcomes:
         for name in filter(COLUMN.fullmatch, row):
             pair = [row[name.replace("found", field)] for field in (*Features._fields, "found")]
             if not math.isnan(pair[-1]):
-                rows.append((*pair, row[SEED], row.get(TISSUE, "silicone")))
+                uneven_db = row[name.replace("found", "uneven_db")]
+                rows.append((*pair, row[SEED], row.get(TISSUE, "silicone"), uneven_db))
     if not rows:
         raise InputError("trials: expected some with pairs of a mass and a way, found none")
-    *features, found, seed, tissue = zip(*rows, strict=True)
-    return Outcomes(Features(*map(np.array, features)), np.array(found) > 0, np.array(seed), np.array(tissue))
+    *features, found, seed, tissue, uneven_db = (np.array(column) for column in zip(*rows, strict=True))
+    return Outcomes(Features(*features), found > 0, seed, tissue, uneven_db)
 
 
 def halves(pairs: Outcomes) -> tuple[Outcomes, Outcomes]:
-    """Pairs of even seeds, and of odd ones."""
-    even = pairs.seed % 2 == 0
-    return pairs.of(even), pairs.of(~even)
+    """Pairs of the first seeds of each eight, and of the last; both have breasts of every density."""
+    first = pairs.seed // len(patient_trial.DENSITIES) % 2 == 0
+    return pairs.of(first), pairs.of(~first)
 
 
 def report(tables: Iterable[Table]) -> Iterator[str]:
-    """Lines: the fitted coefficients, and the reliability of both these and the assumed ones by pairs of odd seeds.
+    """Lines: coefficients fitted to even and to grown tissue, and the reliability of these and of those in use by the other half.
 
     Raises
     ------
     InputError
-        As `calibrate`, or if there is no pair of an odd seed.
+        If there is no pair.
     """
-    kept = list(tables)
-    fitting, testing = halves(outcomes(kept))
-    if not testing.found.size:
-        raise InputError("trials: expected some of odd seeds, to test with, found none")
-    fitted = calibrate(kept)
-    yield f"fitted      by {fitting.found.size} pairs of even seeds, of which {fitting.found.sum()} were found"
-    for name, value in asdict(fitted).items():
-        yield f"            {name} {value:.3f}, assumed {getattr(ASSUMED, name):g}"
-    tissues = np.unique(testing.tissue).tolist()
-    for title, chosen in [("all", testing), *((one, testing.of(testing.tissue == one)) for one in tissues)]:
-        yield from _tested(title, chosen, fitted)
+    pairs = outcomes(tables)
+    grown = np.array([seen_trial.LOOKS.sees(one) for one in pairs.uneven_db])
+    for name, used, chosen in (("even", EVEN, ~grown), ("grown", GROWN, grown)):
+        if not chosen.any():
+            continue
+        fitting, testing = halves(pairs.of(chosen))
+        if not testing.found.size:
+            yield f"not fitted  to {name} tissue: expected pairs of seeds 4 to 7, to test with, found none"
+            continue
+        try:
+            fitted = detectability.fit(fitting.features, fitting.found)
+        except InputError as error:
+            yield f"not fitted  to {name} tissue: {error}"
+            continue
+        yield f"fitted      to {fitting.found.size} pairs in {name} tissue, of which {fitting.found.sum()} were found"
+        for field, value, before in zip(fields(fitted), fitted.coefficients, used.coefficients, strict=False):
+            yield f"            {field.name} {value:.3f}, in use {before:g}"
+        tissues = np.unique(testing.tissue).tolist()
+        for title, part in [("all", testing), *((one, testing.of(testing.tissue == one)) for one in tissues)]:
+            yield from _tested(title, part, fitted, used)
 
 
 def shares(chance: Array, found: Mask, ranges: Iterable[tuple[float, float]]) -> Iterator[str]:
@@ -121,11 +122,11 @@ def shares(chance: Array, found: Mask, ranges: Iterable[tuple[float, float]]) ->
             yield f"{low:.2f}-{high:.2f}   {chance[there].mean():.2f} predicted, {hit / count:.2f} found ({bounds}) of {count}"
 
 
-def _tested(title: str, pairs: Outcomes, fitted: Calibration) -> Iterator[str]:
+def _tested(title: str, pairs: Outcomes, fitted: Calibration, used: Calibration) -> Iterator[str]:
     """Lines on pairs that nothing was fitted to."""
-    chance, assumed = (detectability.probability(pairs.features, one) for one in (fitted, ASSUMED))
-    brier, before = (float(np.mean((one - pairs.found) ** 2)) for one in (chance, assumed))
-    yield f"tested      {title}: {pairs.found.size} pairs, Brier score {brier:.3f}, of the assumed coefficients {before:.3f}"
+    chance, earlier = (detectability.probability(pairs.features, one) for one in (fitted, used))
+    brier, before = (float(np.mean((one - pairs.found) ** 2)) for one in (chance, earlier))
+    yield f"tested      {title}: {pairs.found.size} pairs, Brier score {brier:.3f}, of the coefficients in use {before:.3f}"
     yield from (f"            {line}" for line in shares(chance, pairs.found, BINS))
     yield from (f"bar         {line}" for line in shares(chance, pairs.found, BARS))
 

@@ -4,7 +4,7 @@ A mass taken one way is a pair, from which the coefficients of `recon.segmentati
 of `PoseNoise` and its covariance; probe, lag and the mean speed of sound are known, and so is the skin.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +22,10 @@ from recon.freehand.volume_compounding import Clip
 from recon.geometry import rigid
 from recon.geometry.surface_tree import signed_distances
 from recon.segmentation import detectability, echo_power, insonation, masses
-from recon.segmentation.detectability import Features
+from recon.segmentation.detectability import Calibration, Features
+from recon.segmentation.mass_network import Looks
+from recon.segmentation.mass_surface import Mass
+from recon.segmentation.refraction import Sound
 from recon.session import masses_step
 from scenes.acoustics import TISSUES
 from scenes.kinds import breast
@@ -44,6 +47,7 @@ Levels = Callable[[Sequence[Thing], Scans], Array]
 SEED = 900  # of the first breast
 WAYS = ("all", "every", "gap", "first")  # in which a sweep is taken
 METHOD = masses_step.Method(overlays=0)
+LOOKS = Looks(METHOD.looks)
 STEP_MM, SHELL_MM = 0.5, 3.0  # of the grid on which echoes are averaged, and around a mass, with which its own are compared
 LEAST_POWER = 1e-3  # of the tissue's: cysts have none
 DRAWN = {"any_words": True, "count": (2, 5), "size_mm": (6.0, 22.0), "apart_mm": 1.0}  # masses of patients
@@ -95,6 +99,11 @@ class Pair(NamedTuple):
         """Features of the mass."""
         return Features(*(np.array(getattr(self, name)) for name in Features._fields))
 
+    @property
+    def calibration(self) -> Calibration:
+        """Coefficients for its tissue."""
+        return detectability.calibration_for(self.uneven_db, LOOKS)
+
 
 @dataclass(frozen=True)
 class Kind:
@@ -108,7 +117,7 @@ class Kind:
 
 
 def measure(settings: Settings, seed: int) -> Metrics:
-    """All pairs of one breast, their number, the number found and the number expected by the assumed coefficients."""
+    """All pairs of one breast, their number, the number found and the number expected by the coefficients in use."""
     kind = KINDS[settings.seen.tissue]
     chosen = SweepSettings(
         rig=settings.rig,
@@ -217,10 +226,12 @@ def shown_levels(hidden: Sequence[Thing], scans: Scans) -> Array:
 
 def pairs_of(way: int, hidden: Sequence[Thing], levels: Array, scans: Scans, skin: trimesh.Trimesh) -> list[Pair]:
     """A pair of each true mass, of levels : (n,) dB, by what the software finds in B-scans taken one way."""
+    if not hidden:
+        return []
     said = masses_step.find(scans, METHOD, skin)
     rested, face_row = said.scans or scans, 0.0 if scans.probe is None else scans.probe.face_row
-    places = rested.world_from_pixel, rested.shape, rested.stream()
-    where = insonation.of_sweep(*places, spread=METHOD.spreads, face_row=face_row)
+    places = rested.world_from_pixel, rested.shape, without(hidden, rested)
+    where = insonation.of_sweep(*places, spread=METHOD.spreads, face_row=face_row, dynamic_range_db=METHOD.dynamic_range_db)
     uneven_db = said.figures.get("tissue_uneven_db", np.nan)
     middles, sizes = np.array([thing.mesh.center_mass for thing in hidden]), [ball_mm(thing.mesh) for thing in hidden]
     given = detectability.features_at(where, middles, sizes, np.abs(levels), levels > 0, uneven_db)
@@ -234,17 +245,25 @@ def pairs_of(way: int, hidden: Sequence[Thing], levels: Array, scans: Scans, ski
     return pairs
 
 
+def without(hidden: Sequence[Thing], scans: Scans) -> Iterator[NDArray[np.uint8]]:
+    """B-scans : n times (h, w) with tissue in place of masses: where these are large and dark they would count as shadows."""
+    placed, sound = scans.world_from_pixel, Sound(scans.speed_m_s, scans.speed_m_s)
+    grey = np.uint8(masses.tissue_grey(scans.stream(), scans.shape, placed))
+    inside = masses.shown([Mass(thing.mesh) for thing in hidden], placed, scans.shape, sound)
+    return (np.where(one, grey, image) for one, image in zip(inside, scans.stream(), strict=True))
+
+
 def ball_mm(body: trimesh.Trimesh) -> float:
     """Diameter, mm, of a ball of a body's volume."""
     return float(np.cbrt(6 / np.pi * body.volume))
 
 
 def figures(pairs: Sequence[Pair]) -> Metrics:
-    """Columns of all pairs, their number, those found, those expected by the assumed coefficients, and the Brier score."""
+    """Columns of all pairs, their number, those found, those expected by the coefficients in use, and the Brier score."""
     columns = {f"pair{n:02d}_{name}": float(value) for n, pair in enumerate(pairs) for name, value in pair._asdict().items()}
     found = np.array([pair.found for pair in pairs])
-    chance = detectability.probability(Features(*np.transpose([pair.features for pair in pairs])))
-    brier = float(np.mean((chance - found) ** 2))
+    chance = np.array([float(detectability.probability(pair.features, pair.calibration)) for pair in pairs])
+    brier = float(np.mean((chance - found) ** 2)) if pairs else 0.0
     return {"pairs": len(pairs), "found": int(found.sum()), "expected": float(chance.sum()), "brier": brier, **columns}
 
 

@@ -72,6 +72,7 @@ def test_what_was_seen_is_a_table_and_a_layer(scene, tmp_path):
     assert fused_scene.layers(seen, 1)["unseen"].bounds == pytest.approx(box.bounds)
     *_, section = scene_page.numbers(seen)
     assert section.title == "Seen" and all(word in section.blocks[0] for word in ("8 mm", "15 dB", "25\xa0%", "100\xa0%"))
+    assert "by assumed coefficients" in section.blocks[0]
     shown = {shape.name: shape.shown for shape in scene_page._bodies(seen)}
     assert shown == {"skin": True, "mass0": True, "unseen": False}
 

@@ -1,6 +1,7 @@
 """The page's figures: each is there by its name, in its place whatever it is, and no text of others is HTML."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -41,7 +42,11 @@ def test_each_figure_stands_under_its_name():
 
 def test_the_share_that_was_seen_stands_last():
     seen = SeenSoFar(0.426, 212_400.0, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-    assert rows(html_of(Moment(4, 0, POSE, "target predicted", seen=seen), ()))[-1] == ["Seen", "43 % of 212 cm³"]
+    told = "43 % of 212 cm³, by assumed coefficients"
+    assert rows(html_of(Moment(4, 0, POSE, "target predicted", seen=seen), ()))[-1] == ["Seen", told]
+    known = replace(seen, uneven_db=3.42, source="by coefficients fitted to 900 trials")
+    told = "43 % of 212 cm³, by coefficients fitted to 900 trials; tissue uneven by 3.4 dB"
+    assert rows(html_of(Moment(4, 0, POSE, "target predicted", seen=known), ()))[-1] == ["Seen", told]
 
 
 def test_without_a_b_scan_no_row_goes_away():

@@ -1,7 +1,5 @@
 """The observer: what it depends on, against closed forms, and coefficients that are found again."""
 
-from dataclasses import astuple
-
 import numpy as np
 import pytest
 
@@ -9,6 +7,7 @@ from recon.errors import InputError
 from recon.geometry import rigid
 from recon.segmentation import detectability, insonation
 from recon.segmentation.detectability import OBSERVER, Ball, Calibration, Features, Sought
+from recon.segmentation.mass_network import Looks
 from tests.recon.pose_stacks import SHAPE, stack, sweep, voxel
 
 
@@ -114,7 +113,7 @@ def test_coefficients_are_found_again(rng):
     found = detectability.fit(given, rng.random(len(share)) < share)
     design = np.column_stack([np.ones(len(share)), *given])
     sigma = np.sqrt(np.diag(np.linalg.inv((design * (share * (1 - share))[:, None]).T @ design)))
-    assert (np.abs(np.subtract(astuple(found), astuple(true))) < 4 * sigma).all()
+    assert (np.abs(np.subtract(found.coefficients, true.coefficients)) < 4 * sigma).all() and found.trials == len(share)
 
 
 def test_a_fit_never_rewards_a_worse_view(rng):
@@ -134,22 +133,21 @@ def test_trials_that_say_nothing_are_refused(rng):
 def test_trials_parted_by_a_feature_give_a_finite_fit(rng):
     given = trials(rng, 300)
     found = detectability.fit(given, given.detectability > 2)
-    assert np.isfinite(astuple(found)).all() and found.detectability > 5
+    assert np.isfinite(found.coefficients).all() and found.detectability > 5
 
 
-def test_reliable_probabilities_agree_with_the_shares(rng):
-    """Each bin within four standard deviations of its binomial; twice the logit is found out."""
-    given = trials(rng)
-    share = detectability.probability(given)
-    found = rng.random(len(share)) < share
-    predicted, observed, count = detectability.reliability(share, found)
-    assert count.sum() == len(share)
-    assert (np.abs(observed - predicted) < 4 * np.sqrt(predicted * (1 - predicted) / count) + 1e-9).all()
-    sure = share**2 / (share**2 + (1 - share) ** 2)
-    predicted, observed, count = detectability.reliability(sure, found)
-    assert (np.abs(observed - predicted) > 4 * np.sqrt(predicted * (1 - predicted) / count)).any()
-    with pytest.raises(InputError, match="probabilities from 0 to 1"):
-        detectability.reliability([1.2], [True])
+def test_grown_tissue_has_its_own_observer(monkeypatch):
+    """A network, from the unevenness of breasts on; unless looks count always or never."""
+    grown = Calibration(constant=0.0, trials=900)
+    monkeypatch.setattr(detectability, "GROWN", grown)
+    for uneven_db, when, which in (
+        *((0.8, "auto", "even"), (2.7, "auto", "even"), (2.9, "auto", "grown"), (np.nan, "auto", "even")),
+        *((0.8, "always", "grown"), (3.4, "never", "even")),
+    ):
+        chosen = detectability.calibration_for(uneven_db, Looks(when))
+        assert chosen is (grown if which == "grown" else detectability.EVEN)
+    assert detectability.source(grown.trials) == "by coefficients fitted to 900 trials"
+    assert detectability.source(detectability.EVEN.trials) == "by assumed coefficients"
 
 
 def test_a_turned_world_has_the_same_map(rng):

@@ -59,7 +59,7 @@ def test_the_resolution_is_that_of_beam_slice_and_spacing(depth, sigma):
     found = np.interp(depth, at, where.elevational_mm[k, :, i])
     assert found == pytest.approx(np.hypot(sigma, 1 / np.sqrt(12)), abs=0.04)  # by the slice's bends between voxels
     assert np.interp(depth, at, where.lateral_mm[k, :, i]) == pytest.approx(SPREAD_MM[0], rel=1e-3)
-    assert (where.axial_mm == np.float32(SPREAD_MM[1])).all()
+    assert where.axial_mm == SPREAD_MM[1]
 
 
 def test_strokes_that_cross_improve_the_worst_direction():
@@ -133,6 +133,63 @@ def test_lines_without_contact_and_what_lies_behind_the_tissue_are_not_seen():
     where = insonation.of_sweep(matrices, SHAPE, [image] * len(matrices))
     counts = [where.count[voxel(where, place)] for place in ([9, 15, 0], [9, 21, 0], [9, 30, 0], [32, 15, 0])]
     assert counts[0] > 0 and counts[1] > 0 and counts[2] == counts[3] == 0
+
+
+def tissue_of(image):
+    """Pixels that show tissue, 0.25 mm large."""
+    return insonation.tissue(image, (MM, MM))
+
+
+def test_a_bright_strip_below_a_shadow_does_not_make_it_seen():
+    """What is dark for more than 12 mm is a shadow, and what is dark for less may be a mass; the strip itself was seen."""
+    image = np.full(SHAPE, 120, np.uint8)
+    image[40:136, 40:80] = 8  # 24 mm
+    image[40:72, 100:140] = 8  # 8 mm
+    found = tissue_of(image)
+    assert not found[44:132, 42:78].any() and found[140:, 42:78].all() and found[12:36, 42:78].all()
+    assert found[12:, 100:140].all()
+
+
+@pytest.mark.parametrize(("drop_db", "seen"), [(5, True), (12, False)])
+@pytest.mark.parametrize("range_db", [50, 80])
+def test_noise_behind_the_tissue_is_not_seen(drop_db, seen, range_db):
+    """Some dB below the tissue: grey levels are logarithms, so half of one may be 15 or 25 dB below."""
+    image = np.full(SHAPE, 120, np.uint8)
+    image[104:] = 120 - round(drop_db * 255 / range_db)
+    found = insonation.tissue(image, (MM, MM), dynamic_range_db=range_db)
+    assert found[12:100].all() and found[108:].all() == found[108:].any() == seen
+
+
+def test_what_lies_beside_a_fan_is_not_seen(rng):
+    """A trapezium that widens from 12 to 40 mm, to half a millimetre; a black cyst in its middle was seen."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    half = (6 + 14 * v / SHAPE[0]) / MM
+    inside = np.abs(u - 79.5) < half
+    image = np.where(inside, rng.rayleigh(90, SHAPE).clip(1, 255), 0).astype(np.uint8)
+    image[(u - 80) ** 2 + (v - 90) ** 2 < 12**2] = 0
+    found = tissue_of(image)
+    assert not found[np.abs(u - 79.5) > half + 2].any()
+    assert found[(np.abs(u - 79.5) < half - 4) & (v >= 12)].all()
+    where = insonation.of_sweep(stack(np.arange(-15, 15.1, 0.5)), SHAPE, [image] * 61)
+    assert where.seen[voxel(where, [4, 8, 0])] == 0 and where.seen[voxel(where, [20, 8, 0])] == 1
+    assert where.room_mm[voxel(where, [4, 8, 0])] < 0, "no mass is sought there"
+
+
+@pytest.mark.parametrize("face_row", [-60, 40])
+def test_ringing_and_depths_begin_at_the_face(face_row):
+    """One 10 mm down in the image rings down to 13 mm; one 15 mm above a clip doesn't show its ringing."""
+    where = insonation.of_sweep(stack(np.arange(-15, 15.1, 0.5)), SHAPE, face_row=face_row)
+    y = insonation.centres(where.grid)[..., 1]
+    k, _, i = voxel(where, [20, 20, 0])
+    assert y[k, where.count[k, :, i] > 0, i].min() == pytest.approx(13 if face_row > 0 else 0, abs=1.01)
+    np.testing.assert_allclose(where.under_mm[where.hull], (y - face_row * MM)[where.hull], atol=1e-3)
+
+
+@pytest.mark.parametrize("image", [np.full((80, 160), 90, np.uint8), np.full((*SHAPE, 3), 90, np.uint8), np.full(SHAPE, 90.0)])
+def test_images_of_another_size_or_colour_are_refused(image):
+    with pytest.raises(InputError, match="image: expected 160x160 px of 8-bit grey, found") as error:
+        insonation.of_sweep(stack([0.0, 1.0]), SHAPE, [image] * 2)
+    assert "\n" not in str(error.value)
 
 
 def test_places_are_under_the_skin():

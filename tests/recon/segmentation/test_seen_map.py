@@ -1,14 +1,18 @@
-"""The map of what was seen: its figures, its surface, its files, and how long it takes."""
+"""The map of what was seen: its figures, its surface and its files."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from recon.errors import InputError
 from recon.files import volumes
 from recon.freehand.scans import Scans
 from recon.geometry import rigid
-from recon.segmentation import insonation, seen_map
-from recon.segmentation.detectability import Sought
+from recon.segmentation import detectability, insonation, seen_map
+from recon.segmentation.detectability import Calibration, Sought
+from recon.segmentation.echo_power import SPREAD_MM
 from tests.recon.pose_stacks import SHAPE, stack, voxel
 
 
@@ -27,6 +31,52 @@ def test_a_mass_is_seen_within_the_pieces_and_not_in_the_gap(mapped):
     assert not mapped.unseen[at["within"]] and mapped.unseen[at["gap"]]
     assert mapped.unseen[voxel(mapped.where, [45, 20, 18])], "beside the hull is still to be scanned"
     assert not mapped.room[voxel(mapped.where, [20, 1, 18])], "where a ball would stand out of the skin none is"
+
+
+@pytest.mark.parametrize("size", [4.0, 8.0, 20.0])
+@pytest.mark.parametrize("face_row", [0, 40])
+@pytest.mark.parametrize("tilt_deg", [0, 20])
+def test_a_perfect_sweep_leaves_nothing_unseen_away_from_its_sides(size, face_row, tilt_deg):
+    """Places in the ringing, and within half a mass of it or of the images' lower end, aren't planned; all between are."""
+    tilt = rigid.from_rotation_vector([np.deg2rad(tilt_deg), 0, 0], [0, 0, 0])
+    where = insonation.of_sweep(tilt @ stack(np.arange(-30, 30.1, 0.25)), SHAPE, face_row=face_row)
+    seen = seen_map.look(where, Sought(size, 20.0))
+    x, y, z = np.moveaxis(rigid.apply(np.linalg.inv(tilt), insonation.centres(where.grid)), -1, 0)
+    away = (np.abs(x - 20) < 18 - size / 2) & (np.abs(z) < 26 - size / 2)
+    assert not (seen.unseen & away).any()
+    first = max(0, face_row * 0.25) + 3
+    assert seen.room[away & (y > first + size / 2 + 4) & (y < 40 - size / 2 - 4)].all() or tilt_deg
+
+
+def test_a_skin_above_the_gel_does_not_make_the_ringing_a_place():
+    """With the skin 20 mm above what is scanned, ringing and lower end limit the planned volume, too."""
+    where = insonation.of_sweep(stack(np.arange(-15, 15.1, 0.25)), SHAPE)
+    y = insonation.centres(where.grid)[..., 1]
+    planned = seen_map.planned(replace(where, under_mm=where.under_mm + 20), 8.0)
+    assert y[planned].min() > 3 + 4 and y[planned].max() < 40 - 4
+
+
+def test_a_line_and_files_say_whether_coefficients_are_assumed(mapped, monkeypatch):
+    assert "8 dB, by assumed coefficients; " in mapped.line and mapped.table.source == "by assumed coefficients"
+    monkeypatch.setattr(detectability, "GROWN", Calibration(constant=9.0, trials=900))
+    grown = seen_map.look(mapped.where, uneven_db=3.4)
+    assert "by coefficients fitted to 900 trials" in grown.line and grown.table.trials == 900
+    assert grown.probability.max() > 0.999, "by the coefficients for grown tissue"
+
+
+def test_the_table_says_how_the_scan_was_insonified(mapped):
+    """Medians of a straight sweep along z: from above, in the middle of 3 to 40 mm, by the array's echoes."""
+    found = mapped.table.insonified
+    assert found.beam == pytest.approx((0, 1, 0), abs=1e-6) and found.turned_deg == pytest.approx(0, abs=0.1)
+    assert found.depth_mm == pytest.approx(21.5, abs=1) and found.under_mm == pytest.approx(found.depth_mm, abs=0.1)
+    assert (found.lateral_mm, found.axial_mm) == pytest.approx(SPREAD_MM, rel=1e-3)
+    assert found.lateral_mm < found.elevational_mm < 1 and found.gap_mm == 0
+
+
+@pytest.mark.parametrize("shares", [(), ((0.1,),), 5 * ((0.1, 0.2, 0.3),), 4 * (4 * (0.1,),)])
+def test_a_table_of_another_shape_is_refused(shares):
+    with pytest.raises(ValidationError, match="shares: expected 5 rows with 4 each"):
+        seen_map.Table(size_mm=8, contrast_db=8, shares=shares)
 
 
 def test_figures_are_volumes_of_what_was_scanned(mapped):
@@ -63,7 +113,8 @@ def test_files_hold_the_map_where_it_is(mapped, tmp_path):
     seen_map.write(tmp_path, mapped)
     found = seen_map.read(tmp_path)
     volume = volumes.read_volume(found.volume)
-    np.testing.assert_array_equal(volume.voxels, mapped.probability)
+    np.testing.assert_array_equal(volume.voxels[mapped.room], mapped.probability[mapped.room])
+    assert (volume.voxels[~mapped.room] == -1).all(), "outside isn't the same as not found"
     k, j, i = voxel(mapped.where, [20, 20, 18])
     assert rigid.apply(volume.world_from_voxel, [float(i), float(j), float(k)]) == pytest.approx([20, 20, 18], abs=1.01)
     assert found.table == mapped.table and found.unseen.volume == pytest.approx(seen_map.unseen_surface(mapped).volume, rel=1e-3)

@@ -1,6 +1,4 @@
-"""Coefficients are fitted to even seeds and tested on odd ones, by made-up pairs of known chances."""
-
-from dataclasses import astuple
+"""Coefficients are fitted to some breasts of each density and tested on others, by made-up pairs of known chances."""
 
 import numpy as np
 import pyarrow as pa
@@ -9,35 +7,60 @@ import pytest
 
 from recon.errors import InputError
 from recon.segmentation import detectability
-from recon.segmentation.detectability import ASSUMED, Calibration, Features
-from twin.experiments import seen_calibration
+from recon.segmentation.detectability import EVEN, Calibration, Features
+from twin.experiments import patient_trial, seen_calibration
 
 TRUE = Calibration(-7.0, 2.5, 1.2, -30.0, -1.5)
 
 
-def table(rng, even=TRUE, odd=TRUE, tissue="silicone", trials=160, pairs=24):
-    """Trials of masses that differ in all features, found by the chances of one calibration in even seeds and another in odd."""
+def table(rng, fitting=TRUE, testing=TRUE, tissue="silicone", trials=160, pairs=24, uneven_db=0.8):
+    """Trials of masses that differ in all features, found by the chances of one calibration in seeds to fit, of another else."""
     rows = []
     for seed in range(trials):
         unseen = np.maximum(rng.normal(0, 0.08, pairs), 0)
         given = Features(rng.normal(2, 1, pairs), rng.normal(1.5, 0.5, pairs), unseen, (rng.random(pairs) < 0.3).astype(float))
-        found = rng.random(pairs) < detectability.probability(given, odd if seed % 2 else even)
-        columns = given._asdict() | {"found": found}
+        found = rng.random(pairs) < detectability.probability(given, testing if seed // 4 % 2 else fitting)
+        columns = given._asdict() | {"found": found, "uneven_db": np.full(pairs, uneven_db)}
         row = {f"pair{n:02d}_{name}": float(values[n]) for n in range(pairs) for name, values in columns.items()}
         rows.append({"seen.tissue": tissue, "seed": seed, "pairs": float(pairs), **row, "error": None})
     return rows
 
 
-def test_even_seeds_fit_whatever_odd_ones_say(rng):
-    """Each coefficient within four of its standard errors, by the information of the pairs; odd seeds have others."""
-    rows = table(rng, odd=Calibration(3.0, 0.1, 0.1, -1.0, 2.0))
+def printed(lines):
+    """Fitted coefficients, in order, a list a tissue."""
+    values = [float(line.split()[1].rstrip(",")) for line in lines if ", in use " in line]
+    return [values[n : n + 5] for n in range(0, len(values), 5)]
+
+
+def test_one_half_fits_whatever_the_other_says(rng):
+    """Each coefficient within four of its standard errors, by the information of the pairs; seeds to test with have others."""
+    rows = table(rng, testing=Calibration(3.0, 0.1, 0.1, -1.0, 2.0))
     fitting, testing = seen_calibration.halves(seen_calibration.outcomes([rows]))
-    assert set(fitting.seed % 2) == {0} and set(testing.seed % 2) == {1} and fitting.found.size == testing.found.size == 80 * 24
+    assert not set(fitting.seed) & set(testing.seed) and fitting.found.size == testing.found.size == 80 * 24
     share = detectability.probability(fitting.features, TRUE)
     design = np.column_stack([np.ones(len(share)), *fitting.features])
     sigma = np.sqrt(np.diag(np.linalg.inv((design * (share * (1 - share))[:, None]).T @ design)))
-    found = seen_calibration.calibrate([rows])
-    assert (np.abs(np.subtract(astuple(found), astuple(TRUE))) < 4 * sigma).all()
+    (found,) = printed(seen_calibration.report([rows]))
+    assert (np.abs(np.subtract(found, TRUE.coefficients)) < 4 * sigma).all()
+
+
+def test_both_halves_have_breasts_of_every_density(rng):
+    """A patient's density goes by its seed."""
+    count = len(patient_trial.DENSITIES)
+    for half in seen_calibration.halves(seen_calibration.outcomes([table(rng, trials=16, pairs=1)])):
+        assert set(half.seed % count) == set(range(count))
+
+
+def test_grown_tissue_has_coefficients_of_its_own(rng):
+    """There masses are told by their looks; tissue of unknown unevenness counts as even."""
+    looks = Calibration(-2.0, 0.5, 1.5, -10.0, 0.0)
+    rows = table(rng, looks, looks, "patients", uneven_db=3.4)
+    lines = list(seen_calibration.report([table(rng, uneven_db=float("nan")), rows]))
+    even, grown = printed(lines)
+    assert np.abs(np.subtract(even, TRUE.coefficients))[1:3].max() < 0.6 and np.abs(even[3] - TRUE.unseen) < 6
+    assert np.abs(np.subtract(grown, looks.coefficients))[1:3].max() < 0.6 and np.abs(grown[3] - looks.unseen) < 6
+    (few,) = seen_calibration.report([[rows[0]]])
+    assert few.startswith("not fitted  to grown tissue: expected pairs of seeds 4 to 7")
 
 
 def test_pairs_that_a_trial_does_not_have_count_as_none(rng):
@@ -63,7 +86,7 @@ def test_shares_have_the_interval_of_clopper_and_pearson():
     ]
 
 
-def test_the_report_tests_each_tissue_by_odd_seeds(rng, tmp_path):
+def test_the_report_tests_each_tissue_by_the_other_half(rng, tmp_path):
     """As read from studies' folders; fitted coefficients are better than assumed ones where these are wrong."""
     for tissue, trials in (("silicone", 80), ("patients", 40)):
         (tmp_path / tissue).mkdir()
@@ -75,8 +98,6 @@ def test_the_report_tests_each_tissue_by_odd_seeds(rng, tmp_path):
     assert [line.split()[1:3] for line in tested] == [["all:", "1440"], ["patients:", "480"], ["silicone:", "960"]]
     assert all(float(line.split()[-1]) > float(line.split("score ")[1].split(",")[0]) for line in tested)
     assert sum(line.startswith("bar  ") for line in lines) == 6
-    assert f"assumed {ASSUMED.unseen:g}" in lines[4]
-    with pytest.raises(InputError, match="expected some of odd seeds"):
-        list(seen_calibration.report([[row for row in tables[0] if row["seed"] % 2 == 0]]))
+    assert f"in use {EVEN.unseen:g}" in lines[4]
     with pytest.raises(InputError, match=r"expected the folder of a study with table\.parquet"):
         seen_calibration.read(tmp_path)

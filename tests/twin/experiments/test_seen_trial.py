@@ -104,14 +104,29 @@ def test_a_mass_is_found_within_half_its_radius_and_30_percent(shift, larger, fo
     assert one.volume_error_percent == pytest.approx(100 * (larger - 1), abs=1e-6)
 
 
+def test_a_large_dark_mass_is_not_its_own_shadow(monkeypatch):
+    """One of 20 mm that is 15 dB darker: its place was seen, whatever it looks like; what a breast shows none of has no pair."""
+    place = (20.0, 20.0, 0.0), 10.0
+    said = SimpleNamespace(meshes={}, figures={}, scans=None)
+    monkeypatch.setattr(seen_trial.masses_step, "find", lambda *_: said)
+    scans = made_up([(*place, GREY - 64)])
+    (one,) = seen_trial.pairs_of(0, [thing(*place)], np.array([-15.0]), scans, trimesh.Trimesh())
+    assert one.unseen < 0.02
+    assert seen_trial.pairs_of(0, [], np.array([]), scans, trimesh.Trimesh()) == []
+
+
 def test_columns_hold_the_pairs():
-    """Two, of which one was found: sums of chances, and their mean squared error."""
+    """Two, of which one was found: sums of chances by the coefficients for their tissue, and their mean squared error."""
     pairs = [Pair(0, 10, 8, 1.0, *place, np.nan, np.nan, found) for *place, found in ((4, 2, 0, 0, 1), (2, 1, 0.1, 1, 0))]
     figures = seen_trial.figures(pairs)
     chance = [float(detectability.probability(pair.features)) for pair in pairs]
     assert (figures["pairs"], figures["found"]) == (2, 1) and figures["expected"] == pytest.approx(sum(chance))
     assert figures["brier"] == pytest.approx(((1 - chance[0]) ** 2 + chance[1] ** 2) / 2)
     assert [figures[f"pair01_{name}"] for name in ("detectability", "resolved", "unseen", "bright", "found")] == [2, 1, 0.1, 1, 0]
+
+
+def test_a_breast_that_shows_no_mass_has_no_pairs():
+    assert seen_trial.figures([]) == {"pairs": 0, "found": 0, "expected": 0, "brier": 0}
 
 
 @pytest.mark.slow
