@@ -28,7 +28,7 @@ Map = NDArray[np.float32]
 
 WEIGHTS = Path(__file__).parent / "weights" / "masses.onnx"
 PIXEL_MM = 0.4  # of what the network sees: masses from 6 mm on are 15 px and more, and speckle is averaged
-GROWN_DB = 2.8  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 3.4 and more
+GROWN_DB = 2.5  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 2.75 and more
 MULTIPLE = 16  # px, of its heights and widths
 INTERFACE: Interface = ({"scan": (None, 1, None, None)}, {"mask": (None, 1, None, None)})
 
