@@ -4,15 +4,14 @@ Grown tissue is as uneven as masses are: lobules of fat are dark bodies, too, an
 was trained on the twin's patients alone, see docs/training.md.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from recon import threads
@@ -20,17 +19,24 @@ from recon.errors import InputError, reason
 from recon.freehand.volume_compounding import Clip, Grid
 from recon.segmentation import echo_power
 from recon.segmentation.echo_power import EchoPower, Placed
-from recon.tracking import networks
-from recon.tracking.networks import Interface
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
+Shapes = dict[str, tuple[int | None, ...]]
 
 WEIGHTS = Path(__file__).parent / "weights" / "masses.onnx"
 PIXEL_MM = 0.4  # of what the network sees: masses from 6 mm on are 15 px and more, and speckle is averaged
 GROWN_DB = 2.5  # unevenness of tissue from which looks count: clinical images of silicone have 2.2, breasts 2.75 and more
 MULTIPLE = 16  # px, of its heights and widths
-INTERFACE: Interface = ({"scan": (None, 1, None, None)}, {"mask": (None, 1, None, None)})
+INTERFACE: tuple[Shapes, Shapes] = ({"scan": (None, 1, None, None)}, {"mask": (None, 1, None, None)})
+
+
+class Network(Protocol):
+    """A network as ONNX Runtime runs it."""
+
+    def run(self, names: Any, given: Any, /) -> Sequence[Any]:
+        """Answers of some names, of what is given by names."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -38,14 +44,14 @@ class Looks:
     """When masses are told from tissue by their looks, and by which network."""
 
     when: Literal["auto", "always", "never"] = "auto"  # auto: in tissue that is as uneven as a breast
-    network: onnxruntime.InferenceSession | None = None  # the one that comes with the software
+    network: Network | None = None  # the one that comes with the software
 
     def sees(self, uneven_db: float) -> bool:
         """Whether they count, in tissue whose power has a standard deviation."""
         return self.when == "always" or (self.when == "auto" and uneven_db >= GROWN_DB)
 
 
-def opened(path: Path = WEIGHTS) -> onnxruntime.InferenceSession:
+def opened(path: Path = WEIGHTS) -> Network:
     """The network of a file.
 
     Raises
@@ -53,6 +59,8 @@ def opened(path: Path = WEIGHTS) -> onnxruntime.InferenceSession:
     InputError
         If the file is missing, isn't a network, or another one, such as of one size of images.
     """
+    from recon.tracking import networks  # its runtime takes a tenth of a second to import, which most steps have no use for
+
     session = networks.session(path, INTERFACE, threads=1)
     for height, width in ((MULTIPLE, 2 * MULTIPLE), (3 * MULTIPLE, MULTIPLE)):
         scan = np.zeros((1, 1, height, width), np.float32)
@@ -67,7 +75,7 @@ def opened(path: Path = WEIGHTS) -> onnxruntime.InferenceSession:
 
 
 @cache
-def shipped() -> onnxruntime.InferenceSession:
+def shipped() -> Network:
     """The network that comes with the software."""
     return opened()
 
@@ -94,7 +102,7 @@ def averaged(
     world_from_pixel: Array,
     grid: Grid,
     clip: Clip,
-    network: onnxruntime.InferenceSession | None = None,
+    network: Network | None = None,
 ) -> EchoPower:
     """Mean probability of a mass on a grid, in place of power: `recon.segmentation.echo_power.averaged`.
 
@@ -117,14 +125,14 @@ def averaged(
 
 
 def probabilities(
-    images: Iterable[NDArray[np.uint8]], pixel_mm: tuple[float, float], network: onnxruntime.InferenceSession | None = None
+    images: Iterable[NDArray[np.uint8]], pixel_mm: tuple[float, float], network: Network | None = None
 ) -> Iterator[Map]:
     """Probability of a mass in each pixel of B-scans : n times (h, w), at their own resolution."""
     session = network or shipped()
     return threads.mapped(lambda image: _probability(image, pixel_mm, session), images)
 
 
-def _probability(image: NDArray[np.uint8], pixel_mm: tuple[float, float], session: onnxruntime.InferenceSession) -> Map:
+def _probability(image: NDArray[np.uint8], pixel_mm: tuple[float, float], session: Network) -> Map:
     """That of one B-scan : (h, w)."""
     height, width = image.shape
     high, wide = reduced_size((height, width), pixel_mm)

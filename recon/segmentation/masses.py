@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import onnxruntime
 from numpy.typing import NDArray
 
 from recon import arguments, threads
@@ -16,7 +15,7 @@ from recon.segmentation import blur_correction, border_fit, echo_power, mass_net
 from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.left_out import LeftOut, Reason
-from recon.segmentation.mass_network import Looks
+from recon.segmentation.mass_network import Looks, Network
 from recon.segmentation.mass_surface import Mass, distances, evened, parted
 from recon.segmentation.refraction import Sound, follow
 from recon.segmentation.rough_bodies import FAINT, LIMITS, LOOK, Found, Rough, faint, in_words, likely, rough, say
@@ -125,9 +124,7 @@ def from_scans(
     return Found(sorted(masses, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
 
 
-def _by_looks(
-    recording: Recording, begun: Rough, power: EchoPower, sound: Sound, network: onnxruntime.InferenceSession | None
-) -> Found:
+def _by_looks(recording: Recording, begun: Rough, power: EchoPower, sound: Sound, network: Network | None) -> Found:
     """Masses in grown tissue, which is as uneven as they are: by their looks, with borders fitted to the power."""
     grid = grid_of(power.volume)
     chance = mass_network.averaged(recording.images(), recording.world_from_pixel, grid, recording.clip, network)

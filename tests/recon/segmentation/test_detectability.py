@@ -141,7 +141,7 @@ def test_grown_tissue_has_its_own_observer(monkeypatch):
     grown = Calibration(constant=0.0, trials=900)
     monkeypatch.setattr(detectability, "GROWN", grown)
     for uneven_db, when, which in (
-        *((0.8, "auto", "even"), (2.7, "auto", "even"), (2.9, "auto", "grown"), (np.nan, "auto", "even")),
+        *((0.8, "auto", "even"), (2.4, "auto", "even"), (2.6, "auto", "grown"), (np.nan, "auto", "even")),
         *((0.8, "always", "grown"), (3.4, "never", "even")),
     ):
         chosen = detectability.calibration_for(uneven_db, Looks(when))
