@@ -287,13 +287,8 @@ def likely(chance: EchoPower, power: EchoPower, begun: Rough) -> Found:
 
 def _wide_gaps(power: EchoPower) -> Mask:
     """Voxels in gaps of the scan that cut masses in two."""
-    spacing, gaps, wide = power.volume.spacing[::-1], *np.zeros((2, *power.weight.shape), bool)
-    for axis in (0, 2):  # what lies between two B-scans is no gap along the array
-        width = _gap_widths(power.seen, axis, float(spacing[axis]))
-        width[gaps | (width > GAP.widths_mm[1])] = 0
-        gaps |= width > 0
-        wide |= width >= GAP.widths_mm[0]
-    return wide
+    across, along = _widths(power)
+    return (across >= GAP.widths_mm[0]) | (along >= GAP.widths_mm[0])
 
 
 def _level(one: Candidate, power: EchoPower) -> float:
@@ -459,9 +454,7 @@ def gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
     """Voxels that no B-scan shows, with B-scans on both sides, where masses are missed; and the largest of these gaps."""
     spacing, gaps, found = power.volume.spacing[::-1], np.zeros(power.weight.shape, bool), list[LeftOut]()
     tall = np.ones((1, int(np.ceil(GAP.height_mm / spacing[1])), 1), bool)
-    for axis, where in ((0, "in the sweep"), (2, "between strokes")):
-        width = _gap_widths(power.seen, axis, float(spacing[axis]))
-        width[gaps | (width > GAP.widths_mm[1])] = 0
+    for width, where in zip(_widths(power), ("in the sweep", "between strokes"), strict=True):
         gaps |= width > 0
         labels, _ = ndimage.label(ndimage.binary_opening(width >= GAP.widths_mm[0], tall))
         for one, part in enumerate(ndimage.find_objects(labels), start=1):
@@ -478,6 +471,18 @@ def gaps(power: EchoPower) -> tuple[Mask, list[LeftOut]]:
     if others := found[GAP.named :]:
         log.warning("%d smaller gaps, %.0f mm3 together, weren't scanned", len(others), sum(gap.volume_mm3 for gap in others))
     return gaps, found
+
+
+def _widths(power: EchoPower) -> tuple[Map, Map]:
+    """Width, mm, of the gap that each voxel is in, across the B-scans and along the array; 0 of those in none.
+
+    What lies between two B-scans is no gap along the array.
+    """
+    spacing = power.volume.spacing[::-1]
+    across, along = (_gap_widths(power.seen, axis, float(spacing[axis])) for axis in (0, 2))
+    across[across > GAP.widths_mm[1]] = 0
+    along[(across > 0) | (along > GAP.widths_mm[1])] = 0
+    return across, along
 
 
 def _gap_widths(seen: Mask, axis: int, step_mm: float) -> Map:
