@@ -84,6 +84,7 @@ def from_scans(
     recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
     power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
+    with_shadows = power
     begun = rough(power)
     even = begun.uneven_db < FAINT.even_db
     looks = looks or Looks()
@@ -103,10 +104,14 @@ def from_scans(
         masses, shadows = _without_shadows(masses, power)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
-    kept = list[Mass]()
+    kept, fading = list[Mass](), [mass for mass in masses if mass.bright and _fades(mass, with_shadows)]
     for number, mass in enumerate(masses):
-        least = FAINT.passed if mass.bright else LIMITS.passed
-        if passed(recording, grid, masses, number, sound) < least:
+        if any(mass is one for one in fading):
+            left_out.append(_left_out("its shadow hides its back", mass, power, "it fades towards its back, which isn't seen"))
+        elif any(_behind(mass, one, power) for one in fading):
+            why = "it may be the back or the shadow of a bright one that fades"
+            left_out.append(_left_out("shadow of a mass", mass, power, why))
+        elif passed(recording, grid, masses, number, sound) < LIMITS.passed:
             left_out.append(_left_out("its shadow hides its back", mass, power, "it is dark behind it, so its back isn't seen"))
         elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
@@ -220,6 +225,32 @@ def _stands_out(mass: Mass, power: EchoPower) -> bool:
         return False
     whole, *each = steps
     return (whole < 0) == mass.bright and min(step / whole for step in each) > 0.5
+
+
+def _fades(mass: Mass, power: EchoPower) -> bool:
+    """Whether a bright mass fades into its own shadow instead of ending at a border, in power with shadows.
+
+    A body that absorbs more than the tissue may be as dark as that before its back. There the power goes on falling as it did
+    within, where behind a border it falls at once and then no more.
+    """
+    inside_mm, behind_mm, far_mm, most = -1.0, 2.0, 6.0, 0.3  # of the border, down the beam; most slope behind over that across
+    array, beam, across = power.volume.directions.T
+    vertices, normals = np.asarray(mass.mesh.vertices), np.asarray(mass.mesh.vertex_normals)
+    aside = (vertices - mass.centre) @ np.column_stack([array, across])
+    middle = ((aside / np.abs(aside).max(axis=0)) ** 2).sum(axis=1) < LIMITS.core**2  # off the sides' own shadows
+    back = vertices[middle & (normals @ beam > 0.5)]
+    levels = [_sampled(power, back + mm * beam) for mm in (inside_mm, behind_mm, far_mm)]
+    if any(np.isfinite(level).sum() == 0 for level in levels):
+        return False
+    inside, behind, far = (np.log(np.nanmean(level)) for level in levels)
+    return bool((behind - far) / (far_mm - behind_mm) > most * (inside - behind) / (behind_mm - inside_mm))
+
+
+def _behind(mass: Mass, other: Mass, power: EchoPower) -> bool:
+    """Whether a mass's middle lies behind that of another, seen along the beam."""
+    array, beam, across = ((mass.centre - other.centre) @ power.volume.directions).tolist()
+    wide, _, long = np.abs((np.asarray(other.mesh.vertices) - other.centre) @ power.volume.directions).max(axis=0).tolist()
+    return beam > 0 and abs(array) < wide and abs(across) < long
 
 
 def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:

@@ -100,7 +100,6 @@ class FaintLimits:
     core_db: float = 2.8  # of contrast in its middle
     beside_mm: float = 2.0  # of masses, where shadows and borders are left over
     least_mm3: float = 80.0
-    passed: float = 0.3  # of power that comes through a bright one, at least: it fades towards its back by as much
     behind: float = 0.5  # share of tissue in what lies behind it: else it may be what the tissue lies on
     behind_mm: float = 5.0  # of that
 

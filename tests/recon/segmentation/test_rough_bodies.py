@@ -1,5 +1,8 @@
 """Are bright, faint, small and shadowing bodies found, or named with their reasons, in even and in uneven tissue?"""
 
+from dataclasses import replace
+from operator import attrgetter
+
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -58,6 +61,24 @@ def test_a_bright_and_a_faint_ball_are_as_large_as_they_are(level, rng):
     assert mass.volume == pytest.approx(volume_of(5.0), rel=0.06 if level > 1 else 0.12)
     assert np.linalg.norm(mass.centre - CENTRE) < (0.1 if level > 1 else 0.3)
     assert masses._stands_out(mass, power)
+
+
+@pytest.mark.parametrize(("radius", "loss_db_mm", "fades"), [(5.0, 0.2, False), (5.0, 0.4, False), (9.0, 0.6, True)])
+def test_a_bright_body_that_fades_into_its_shadow_has_no_back(radius, loss_db_mm, fades, rng):
+    """6 dB above the tissue, at the backs of two still 4 and 2 dB; that of the last is 5 dB below it: what is bright ends within,
+    with no border there.
+    """
+    way_mm = SPACING[1] * np.cumsum(away(radius) < 0, axis=1)
+    power = speckled(tissue(radius, 4.0) * 10 ** (-loss_db_mm * way_mm / 10), rng)
+    first = rough_bodies.rough(power)
+    mass = max(
+        masses.refined(rough_bodies.faint(power, [], first.hidden, signs=(1,)).masses, power, REFINEMENTS),
+        key=attrgetter("volume"),
+    )
+    assert masses._fades(mass, power) == fades
+    assert (mass.volume < 0.8 * volume_of(radius)) == fades
+    behind, before = (replace(mass, mesh=mass.mesh.copy().apply_translation([0, mm, 0])) for mm in (6, -6))
+    assert masses._behind(behind, mass, power) and not masses._behind(before, mass, power)
 
 
 def test_even_tissue_alone_holds_nothing(rng):
