@@ -1,7 +1,8 @@
 """Fit the probability that a mass is found to kept trials of `seen`, and test it on others: predicted against found.
 
-Four seeds fit, one of each density of breast, and the next four test, so that no breast does both. Pairs in even and in grown
-tissue are fitted apart, as masses are found there by their contrast and by their looks. Intervals are of 95 %, exact binomial
+All breasts fit; each is tested by coefficients that were fitted to those of other parts (cross-validation), four seeds in a row
+being in one part, one of each density. Pairs in even and in grown tissue are fitted apart, as masses are found there by their
+contrast and by their looks. Intervals are of 95 %, exact binomial
 (Clopper and Pearson 1934), as if pairs were independent; those of one mass taken in several ways aren't, so they are somewhat too
 narrow.
 
@@ -25,7 +26,7 @@ from scipy.stats import binomtest
 
 from recon.errors import InputError
 from recon.segmentation import detectability
-from recon.segmentation.detectability import EVEN, GROWN, Calibration, Features
+from recon.segmentation.detectability import EVEN, GROWN, Features
 from twin.experiments import patient_trial, seen_trial
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ Table = Sequence[Mapping[str, Any]]  # a row a trial
 
 TABLE, SEED, TISSUE = "table.parquet", "seed", "seen.tissue"  # of a study's folder, and its columns
 COLUMN = re.compile(r"pair\d+_found")
+PARTS = 4  # of the breasts, each tested by the others
 BINS = tuple((k / 10, (k + 1) / 10) for k in range(10))
 BARS = ((0.85, 0.95), (0.4, 0.6))  # places said to be seen, and doubtful ones
 
@@ -75,14 +77,29 @@ def outcomes(tables: Iterable[Table]) -> Outcomes:
     return Outcomes(Features(*features), found > 0, seed, tissue, uneven_db)
 
 
-def halves(pairs: Outcomes) -> tuple[Outcomes, Outcomes]:
-    """Pairs of the first seeds of each eight, and of the last; both have breasts of every density."""
-    first = pairs.seed // len(patient_trial.DENSITIES) % 2 == 0
-    return pairs.of(first), pairs.of(~first)
+def part_of(seed: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Parts of breasts by their seeds, with breasts of every density in each."""
+    return seed // len(patient_trial.DENSITIES) % PARTS
+
+
+def tested(pairs: Outcomes) -> Array:
+    """Probability of each pair : (n,), by coefficients fitted to the breasts of other parts.
+
+    Raises
+    ------
+    InputError
+        If these are too few.
+    """
+    part, chance = part_of(pairs.seed), np.empty(len(pairs.found))
+    for one in np.unique(part):
+        other = pairs.of(part != one)
+        fitted = detectability.fit(other.features, other.found)
+        chance[part == one] = detectability.probability(pairs.of(part == one).features, fitted)
+    return chance
 
 
 def report(tables: Iterable[Table]) -> Iterator[str]:
-    """Lines: coefficients fitted to even and to grown tissue, and the reliability of these and of those in use by the other half.
+    """Lines: coefficients fitted to even and to grown tissue, and how reliable such are on breasts that they weren't fitted to.
 
     Raises
     ------
@@ -94,21 +111,19 @@ def report(tables: Iterable[Table]) -> Iterator[str]:
     for name, used, chosen in (("even", EVEN, ~grown), ("grown", GROWN, grown)):
         if not chosen.any():
             continue
-        fitting, testing = halves(pairs.of(chosen))
-        if not testing.found.size:
-            yield f"not fitted  to {name} tissue: expected pairs of seeds 4 to 7, to test with, found none"
-            continue
+        part = pairs.of(chosen)
         try:
-            fitted = detectability.fit(fitting.features, fitting.found)
+            fitted, chance = detectability.fit(part.features, part.found), tested(part)
         except InputError as error:
             yield f"not fitted  to {name} tissue: {error}"
             continue
-        yield f"fitted      to {fitting.found.size} pairs in {name} tissue, of which {fitting.found.sum()} were found"
+        yield f"fitted      to {part.found.size} pairs in {name} tissue, of which {part.found.sum()} were found"
         for field, value, before in zip(fields(fitted), fitted.coefficients, used.coefficients, strict=False):
             yield f"            {field.name} {value:.3f}, in use {before:g}"
-        tissues = np.unique(testing.tissue).tolist()
-        for title, part in [("all", testing), *((one, testing.of(testing.tissue == one)) for one in tissues)]:
-            yield from _tested(title, part, fitted, used)
+        earlier = detectability.probability(part.features, used)
+        for title in ("all", *np.unique(part.tissue).tolist()):
+            here = (part.tissue == title) | (title == "all")
+            yield from _tested(title, chance[here], earlier[here], part.found[here])
 
 
 def shares(chance: Array, found: Mask, ranges: Iterable[tuple[float, float]]) -> Iterator[str]:
@@ -122,13 +137,12 @@ def shares(chance: Array, found: Mask, ranges: Iterable[tuple[float, float]]) ->
             yield f"{low:.2f}-{high:.2f}   {chance[there].mean():.2f} predicted, {hit / count:.2f} found ({bounds}) of {count}"
 
 
-def _tested(title: str, pairs: Outcomes, fitted: Calibration, used: Calibration) -> Iterator[str]:
-    """Lines on pairs that nothing was fitted to."""
-    chance, earlier = (detectability.probability(pairs.features, one) for one in (fitted, used))
-    brier, before = (float(np.mean((one - pairs.found) ** 2)) for one in (chance, earlier))
-    yield f"tested      {title}: {pairs.found.size} pairs, Brier score {brier:.3f}, of the coefficients in use {before:.3f}"
-    yield from (f"            {line}" for line in shares(chance, pairs.found, BINS))
-    yield from (f"bar         {line}" for line in shares(chance, pairs.found, BARS))
+def _tested(title: str, chance: Array, earlier: Array, found: Mask) -> Iterator[str]:
+    """Lines on pairs, by chances that weren't fitted to them and by those of the coefficients in use."""
+    brier, before = (float(np.mean((one - found) ** 2)) for one in (chance, earlier))
+    yield f"tested      {title}: {found.size} pairs, Brier score {brier:.3f}, of the coefficients in use {before:.3f}"
+    yield from (f"            {line}" for line in shares(chance, found, BINS))
+    yield from (f"bar         {line}" for line in shares(chance, found, BARS))
 
 
 def read(folder: Path) -> Table:
