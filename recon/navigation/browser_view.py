@@ -23,12 +23,13 @@ from recon.navigation.publishing import BodyAt, Moment, StillScene
 from recon.navigation.seen_so_far import SeenSoFar
 from recon.navigation.tool_figures import Alarms
 from recon.own_requests import LOOPBACK
-from recon.segmentation.seen_map import POORLY
+from recon.segmentation.seen_map import WELL
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 TOOL, PLAN = (90, 205, 255), (120, 230, 120)  # colours of tools, in space and in the B-scan, and of the planned path
+HALF_WELL = WELL / 2  # from which what is still to be scanned is paler
 UNSEEN, HALF_SEEN, POINT_MM = (240, 150, 40), (250, 225, 150), 0.5  # colours and size of points that are still to be scanned
 PLAN_MM, AIM_MM = 0.5, 2.0  # radii of the path's line and of its aim
 M = 0.001  # the view is in metres: its nearest and farthest depth suit them
@@ -135,8 +136,8 @@ class BrowserView:
 
 
 def colours_of(seen: SeenSoFar) -> NDArray[np.uint8]:
-    """Colours : (n, 3) of places that are still to be scanned, paler where a mass would be found sooner than not."""
-    return np.where((seen.probability < POORLY)[:, None], UNSEEN, HALF_SEEN).astype(np.uint8)
+    """Colours : (n, 3) of places that are still to be scanned, paler where it was seen half as well as it should be."""
+    return np.where((seen.seen < HALF_WELL)[:, None], UNSEEN, HALF_SEEN).astype(np.uint8)
 
 
 def outlined(scan: PlacedScan, distances: Sequence[MassDistance]) -> Picture:

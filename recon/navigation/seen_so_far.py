@@ -51,7 +51,7 @@ class SeenSoFar:
     share: float  # of the planned volume, that was seen well enough
     planned_mm3: float
     points: Map  # (n, 3) mm in the world, middles of voxels that weren't
-    probability: Map  # (n,) that a mass with its middle there would have been found
+    seen: Map  # (n,) probability that a mass with its middle there is found, over that of one which is seen whole
     uneven_db: float = np.nan  # standard deviation of the tissue's power; NaN where it couldn't be measured
     source: str = detectability.source(0)  # of the coefficients
 
@@ -94,11 +94,11 @@ class RunningMap:
             return None
         uneven_db = float(np.median(self._uneven_db)) if self._uneven_db else np.nan
         calibration = detectability.calibration_for(uneven_db)
-        found = seen_map.probability(where, self.sought, uneven_db, calibration)
-        left = planned & (found < seen_map.WELL)
+        _, seen = seen_map.probability(where, self.sought, uneven_db, calibration)
+        left = planned & (seen < seen_map.WELL)
         points, share = insonation.centres(where.grid)[left].astype(np.float32), float(1 - left.sum() / planned.sum())
         planned_mm3 = float(planned.sum()) * where.voxel_mm3
-        return SeenSoFar(share, planned_mm3, points, found[left], uneven_db, detectability.source(calibration.trials))
+        return SeenSoFar(share, planned_mm3, points, seen[left], uneven_db, detectability.source(calibration.trials))
 
     def _add(self, scan: PlacedScan) -> None:
         """Take in a B-scan; InputError if it has another size than the first or isn't grey, or the grid would be too large."""

@@ -2,21 +2,23 @@
 
 An observer that averages over a body sees its contrast against what the mean scatters by: speckle, of which there are as many
 independent cells as fit into the part of the body that was seen (Smith et al. 1983, *Low-contrast detectability and
-contrast/detail analysis in medical ultrasound*; Wagner et al. 1983, *Statistics of speckle in ultrasound B-scans*), and the
-tissue's own unevenness, which doesn't average away within a lobule. A body is measured if all of it was seen, and if it is
-larger than the blur. A logistic function of these features makes a probability of them, with coefficients that `fit` finds from
+contrast/detail analysis in medical ultrasound*; Wagner et al. 1983, *Statistics of speckle in ultrasound B-scans*), the
+tissue's own unevenness, which doesn't average away within a lobule, and a noise of its own, however large the body (internal
+noise). A body is measured if it is detected, larger than the blur, and seen as a whole. Each of the three is a psychometric
+function, and the probability is their product, with that of a mass which nothing hides. `fit` finds the coefficients from
 trials: one set for even tissue, where masses are found by their contrast, and another for grown tissue, where a network tells
 them by their looks.
 """
 
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.signal import fftconvolve
-from scipy.special import expit
+from scipy.special import expit, log_expit
 
 from recon import arguments
 from recon.errors import InputError
@@ -35,6 +37,7 @@ class Observer:
     speckle_db: float = 5.57  # standard deviation of log-compressed speckle: 10/ln 10 * pi/sqrt(6)
     patch_mm: float = 3.0  # of tissue, within which its unevenness doesn't average away: lobules; assumed
     even_db: float = 0.8  # unevenness of even tissue, where it isn't known; of silicone
+    internal_db: float = 1.0  # its own noise, which no number of cells averages away
     least: float = 0.05  # of detectability, and of a size over the blur: below all are alike
     width: float = 2 * float(np.sqrt(2 * np.log(2)))  # of a blur at half its height, over its standard deviation
 
@@ -60,25 +63,36 @@ class Features(NamedTuple):
     bright: Array  # 1 of a mass that is brighter than the tissue, else 0
 
 
+class Threshold(NamedTuple):
+    """A logistic function of a feature."""
+
+    middle: float  # where it is one half
+    slope: float  # of its log odds
+
+
 @dataclass(frozen=True)
 class Calibration:
-    """Coefficients of the features' sum, whose logistic function is the probability."""
+    """Coefficients: log odds of a mass that nothing hides, and thresholds that each feature has to pass."""
 
-    constant: float = -9.5
-    detectability: float = 3.0  # >= 0
-    resolved: float = 1.5  # >= 0
-    unseen: float = -25.0  # <= 0: with a tenth unseen a body counts as cut
-    bright: float = -1.0
+    dark: float
+    bright: float
+    detectability: Threshold  # of slope >= 0
+    resolved: Threshold  # of slope >= 0
+    unseen: Threshold  # of slope <= 0
     trials: int = 0  # that they were fitted to; 0 of assumed ones
 
     @property
-    def coefficients(self) -> tuple[float, ...]:
-        """The constant, and a coefficient a feature."""
-        return self.constant, self.detectability, self.resolved, self.unseen, self.bright
+    def coefficients(self) -> dict[str, float]:
+        """By name."""
+        thresholds = {name: getattr(self, name)._asdict() for name in Features._fields[:-1]}
+        each = {f"{name}_{part}": value for name, parts in thresholds.items() for part, value in parts.items()}
+        return {"dark": self.dark, "bright": self.bright} | each
 
 
-EVEN, GROWN = Calibration(), Calibration()  # of masses that are found by their contrast, and by their looks
-BOUNDS = ((None, None), (0, None), (0, None), (None, 0), (None, None))  # of the coefficients: a better view never harms
+EVEN = Calibration(7.27, -0.06, Threshold(1.249, 3.11), Threshold(1.269, 9.32), Threshold(0.0347, -50.6), trials=940)
+"""Of masses that are found by their contrast; 39 silicone breasts."""
+GROWN = Calibration(6.73, -5.68, Threshold(0.878, 10.6), Threshold(0.849, 4.71), Threshold(0.0249, -36.0), trials=572)
+"""Of those that are found by their looks; 42 patients who keep still."""
 
 
 class Ball(NamedTuple):
@@ -124,7 +138,7 @@ def features(ball: Ball, elevational_mm: ArrayLike, sought: Sought, uneven_db: A
     with np.errstate(divide="ignore"):
         speckle = OBSERVER.speckle_db**2 / (np.asarray(ball.cells, float) * volume)
     tissue = uneven**2 / max(1.0, volume / OBSERVER.patch_mm**3)
-    detectable = sought.contrast_db / np.sqrt(speckle + tissue)
+    detectable = sought.contrast_db / np.sqrt(speckle + tissue + OBSERVER.internal_db**2)
     resolved = sought.size_mm / (OBSERVER.width * np.maximum(elevational_mm, 1e-6))
     low, shape = OBSERVER.least, np.shape(detectable)
     return Features(
@@ -189,44 +203,58 @@ def source(trials: int) -> str:
     return f"by coefficients fitted to {trials} trials" if trials else "by assumed coefficients"
 
 
-def probability(given: Features, calibration: Calibration = EVEN) -> Array:
-    """Probability that a mass is found whole and measured."""
-    constant, *slopes = calibration.coefficients
-    return expit(constant + sum(slope * one for slope, one in zip(slopes, given, strict=True)))
+def probability(given: Features, calibration: Calibration | None = None) -> Array:
+    """Probability that a mass is found whole and measured; by default in even tissue."""
+    chosen = calibration or EVEN
+    chance = expit(np.where(np.asarray(given.bright) > 0, chosen.bright, chosen.dark))
+    for feature, passed in zip(given, (chosen.detectability, chosen.resolved, chosen.unseen), strict=False):
+        chance = chance * expit(passed.slope * (feature - passed.middle))
+    return chance
 
 
 def fit(given: Features, found: ArrayLike, ridge: float = 1e-3) -> Calibration:
-    """Coefficients by logistic regression: those of the greatest likelihood, of signs by which a better view never harms.
+    """Coefficients of the greatest likelihood, with slopes of signs by which a better view never harms.
 
     Parameters
     ----------
     given : (n,) each, of n trials
     found : (n,) bool, whether each mass was found whole and measured
-    ridge : weight of the squares of the slopes, over the features' standard deviations: keeps them finite where trials are parted
+    ridge : weight of the squares of what coefficients differ from usual ones by, in the features' standard deviations: keeps
+        them finite where trials are parted
 
     Raises
     ------
     InputError
-        If there are fewer trials than coefficients, all were found or none, or arrays don't fit or aren't finite.
+        If there are no more trials than coefficients, all were found or none, or arrays don't fit or aren't finite.
     """
     columns, hit = np.column_stack([np.ravel(one) for one in given]).astype(float), np.ravel(found).astype(bool)
     if len(hit) != len(columns) or not np.isfinite(columns).all():
         raise InputError(f"trials: expected finite features and whether each was found, found {columns.shape} and {len(hit)}")
-    if len(hit) <= columns.shape[1] or hit.all() or not hit.any():
-        raise InputError(
-            f"trials: expected more than {columns.shape[1]}, some found and some not, found {hit.sum()} of {len(hit)}"
-        )
-    scale = columns.std(axis=0)
-    used = scale > 0
-    middle, scale = np.where(used, columns.mean(axis=0), 0), np.where(used, scale, 1)
-    design = np.column_stack([np.ones(len(hit)), (columns - middle) / scale * used])
-    sign = np.where(hit, 1.0, -1.0)
+    usual = np.array(
+        [2.0, 0.0, *3 * (-0.5,), *3 * (3.0,)]
+    )  # log odds of dark and bright ones, middles, slopes towards better views
+    if len(hit) <= len(usual) or hit.all() or not hit.any():
+        raise InputError(f"trials: expected more than {len(usual)}, some found and some not, found {hit.sum()} of {len(hit)}")
+    seen, bright, better = columns[:, :3], columns[:, 3] > 0, np.array([1, 1, -1])
+    middle, scale = seen.mean(axis=0), np.where(seen.std(axis=0) > 0, seen.std(axis=0), 1) * better
+    standard = (seen - middle) / scale
 
-    def misfit(slopes: Array) -> tuple[float, Array]:
-        logit = sign * (design @ slopes)
-        weight = 2 * ridge * np.append(0, slopes[1:])
-        return np.logaddexp(0, -logit).sum() + ridge * float(slopes[1:] @ slopes[1:]), weight - design.T @ (sign * expit(-logit))
+    def misfit(values: Array) -> tuple[float, Array]:
+        odds, middles, slopes = values[:2], values[2:5], values[5:]
+        away = standard - middles
+        logits = np.column_stack([odds[bright.astype(int)], slopes * away])
+        log_chance = log_expit(logits).sum(axis=1)
+        log_missed = np.log(-np.expm1(np.minimum(log_chance, -1e-12)))
+        by_log = np.where(hit, -1.0, np.exp(log_chance - log_missed))[:, None] * expit(-logits)  # slope by each logit
+        by_odds = [by_log[bright == one, 0].sum() for one in (False, True)]
+        slope = np.concatenate([by_odds, -(by_log[:, 1:] * slopes).sum(axis=0), (by_log[:, 1:] * away).sum(axis=0)])
+        less = values - usual
+        return float(-np.where(hit, log_chance, log_missed).sum() + ridge * less @ less), slope + 2 * ridge * less
 
-    found_at = minimize(misfit, np.zeros(design.shape[1]), jac=True, method="L-BFGS-B", bounds=BOUNDS, options={"maxiter": 2000})
-    slopes = found_at.x[1:] / scale * used
-    return Calibration(float(found_at.x[0] - slopes @ middle), *slopes.tolist(), trials=len(hit))
+    bounds = [*2 * ((-10.0, 10.0),), *3 * ((-6.0, 6.0),), *3 * ((0.0, 100.0),)]
+    starts = [[*usual[:2], *3 * (-1.0,), *slopes] for slopes in product((2.0, 10.0), repeat=3)]  # likelihoods have several tops
+    fits = [minimize(misfit, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 2000}) for start in starts]
+    found_at = min(fits, key=lambda one: one.fun).x
+    middles, slopes = (middle + scale * found_at[2:5]).tolist(), (found_at[5:] / scale).tolist()
+    dark, bright_odds = found_at[:2].tolist()
+    return Calibration(dark, bright_odds, *map(Threshold, middles, slopes), trials=len(hit))

@@ -1,7 +1,6 @@
 """The map of what was seen: where a mass of some size and contrast would have been found, had there been one."""
 
 import json
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +19,7 @@ from recon.freehand.scans import Scans
 from recon.geometry import rigid
 from recon.model.part import Fraction, NotNegative, Part, Positive
 from recon.segmentation import detectability, insonation
-from recon.segmentation.detectability import OBSERVER, Calibration, Sought
+from recon.segmentation.detectability import OBSERVER, Ball, Calibration, Sought
 from recon.segmentation.insonation import Insonation, Spread
 from recon.segmentation.mass_network import Looks
 
@@ -30,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 VOLUME, SURFACE, TABLE = "seen.nrrd", "unseen.ply", "seen.json"  # files
 SIZES_MM, CONTRASTS_DB = (4.0, 6.0, 8.0, 12.0, 20.0), (2.5, 5.0, 8.0, 15.0)  # of the table
-WELL, POORLY = 0.9, 0.5  # probability from which a place counts as seen, and below which it counts as unseen
+WELL = 0.5  # of the probability that there is where a mass is seen whole, from which a place counts as seen
 OUTSIDE = -1  # in the volume's file: where the mass has no room, and beside what is to be scanned
 
 
@@ -92,6 +91,7 @@ class Seen:
     where: Insonation
     sought: Sought
     probability: Map  # (nz, ny, nx); 0 outside of the planned volume
+    seen: Map  # (nz, ny, nx) over the probability of a mass that is seen whole there
     table: Table
 
     @property
@@ -102,24 +102,25 @@ class Seen:
     @property
     def unseen(self) -> Mask:
         """Places that are still to be scanned : (nz, ny, nx)."""
-        return self.room & (self.probability < POORLY)
+        return self.room & (self.seen < WELL)
 
     @property
     def figures(self) -> Metrics:
-        """Figures, each named with its unit."""
+        """Volumes of what was scanned that count as seen and as unseen, and the mean probability there."""
         scanned, voxel = self.room & self.where.hull, self.where.voxel_mm3
         return {
-            "seen_mm3": float((scanned & (self.probability >= WELL)).sum()) * voxel,
-            "unseen_mm3": float((scanned & (self.probability < POORLY)).sum()) * voxel,
+            "seen_mm3": float((scanned & (self.seen >= WELL)).sum()) * voxel,
+            "unseen_mm3": float((scanned & (self.seen < WELL)).sum()) * voxel,
+            "seen_probability": float(self.probability[scanned].mean()) if scanned.any() else 0.0,
         }
 
     @property
     def line(self) -> str:
         """A line for the console."""
-        seen, unseen = (value / 1000 for value in self.figures.values())
-        scanned = float((self.room & self.where.hull).sum()) * self.where.voxel_mm3 / 1000
+        seen, unseen, chance = self.figures.values()
         what = f"a mass of {self.sought.size_mm:g} mm and {self.sought.contrast_db:g} dB"
-        return f"seen        {seen:.0f} of {scanned:.0f} cm3 well enough for {what}, {self.table.source}; {unseen:.0f} cm3 not"
+        scanned = f"in the {(seen + unseen) / 1000:.0f} cm3 scanned, {self.table.source}"
+        return f"seen        {what} is found with {100 * chance:.0f} % {scanned}; {unseen / 1000:.0f} cm3 were seen poorly"
 
     @property
     def volume(self) -> Volume:
@@ -145,20 +146,18 @@ def planned(where: Insonation, size_mm: float) -> Mask:
     return where.around & (where.room_mm >= size_mm / 2)
 
 
-def probability(where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration | None = None) -> Map:
-    """Probability : (nz, ny, nx) that a mass with its middle at each place is found, wherever that is."""
-    chosen = calibration or detectability.calibration_for(uneven_db)
-    return next(_probabilities(where, sought.size_mm, [sought], uneven_db, chosen))
+def probability(where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration | None = None) -> tuple[Map, Map]:
+    """Probability : (nz, ny, nx) that a mass with its middle at each place is found, and that over one's which is seen whole."""
+    chosen, ball = calibration or detectability.calibration_for(uneven_db), detectability.ball_means(where, sought.size_mm)
+    found, whole = (
+        _probability(one, where, sought, uneven_db, chosen) for one in (ball, ball._replace(seen=np.ones_like(ball.seen)))
+    )
+    return found, found / np.maximum(whole, np.finfo(np.float32).tiny)
 
 
-def _probabilities(
-    where: Insonation, size_mm: float, several: Iterable[Sought], uneven_db: float, calibration: Calibration
-) -> Iterator[Map]:
-    """The same of several masses of one size."""
-    ball = detectability.ball_means(where, size_mm)
-    for one in several:
-        found = detectability.features(ball, where.elevational_mm, one, uneven_db)
-        yield detectability.probability(found, calibration).astype(np.float32)
+def _probability(ball: Ball, where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration) -> Map:
+    given = detectability.features(ball, where.elevational_mm, sought, uneven_db)
+    return detectability.probability(given, calibration).astype(np.float32)
 
 
 def look(
@@ -175,11 +174,15 @@ def look(
     rows = []
     for size in SIZES_MM:
         scanned = where.hull & planned(where, size)
-        several = [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB]
-        made = _probabilities(where, size, several, uneven_db, calibration)
+        ball, several = (
+            detectability.ball_means(where, size),
+            [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB],
+        )
+        made = [_probability(ball, where, one, uneven_db, calibration) for one in several]
         rows.append(tuple(float(one[scanned].mean()) if scanned.any() else 0.0 for one in made))
     there = planned(where, chosen.size_mm)
-    found = np.where(there, probability(where, chosen, uneven_db, calibration), np.float32(0))
+    found, seen = probability(where, chosen, uneven_db, calibration)
+    found = np.where(there, found, np.float32(0))
     table = Table(
         size_mm=chosen.size_mm,
         contrast_db=chosen.contrast_db,
@@ -187,7 +190,7 @@ def look(
         trials=calibration.trials,
         insonified=insonified(where),
     )
-    return Seen(where, chosen, found, table)
+    return Seen(where, chosen, found, seen, table)
 
 
 def insonified(where: Insonation) -> Insonified | None:
@@ -222,8 +225,8 @@ def unseen_surface(seen: Seen) -> trimesh.Trimesh | None:
     """Closed surfaces : mm about all that is still to be scanned; None where nothing is."""
     if not seen.unseen.any():
         return None
-    field = np.pad(np.where(seen.room, seen.probability, np.float32(1)), 1, constant_values=1)
-    vertices, faces, _, _ = marching_cubes(field, POORLY, gradient_direction="ascent")  # low within
+    field = np.pad(np.where(seen.room, seen.seen, np.float32(1)), 1, constant_values=1)
+    vertices, faces, _, _ = marching_cubes(field, WELL, gradient_direction="ascent")  # low within
     places = rigid.apply(insonation.world_from_voxel(seen.where.grid), vertices[:, ::-1] - 1.0)
     return trimesh.Trimesh(places, faces, process=False)
 

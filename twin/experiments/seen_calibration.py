@@ -118,8 +118,8 @@ def report(tables: Iterable[Table]) -> Iterator[str]:
             yield f"not fitted  to {name} tissue: {error}"
             continue
         yield f"fitted      to {part.found.size} pairs in {name} tissue, of which {part.found.sum()} were found"
-        for field, value, before in zip(fields(fitted), fitted.coefficients, used.coefficients, strict=False):
-            yield f"            {field.name} {value:.3f}, in use {before:g}"
+        for field, value in fitted.coefficients.items():
+            yield f"            {field} {value:.3f}, in use {used.coefficients[field]:g}"
         earlier = detectability.probability(part.features, used)
         for title in ("all", *np.unique(part.tissue).tolist()):
             here = (part.tissue == title) | (title == "all")

@@ -1,12 +1,15 @@
 """The observer: what it depends on, against closed forms, and coefficients that are found again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.special import expit
 
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.segmentation import detectability, insonation
-from recon.segmentation.detectability import OBSERVER, Ball, Calibration, Features, Sought
+from recon.segmentation.detectability import OBSERVER, Ball, Calibration, Features, Sought, Threshold
 from recon.segmentation.mass_network import Looks
 from tests.recon.pose_stacks import SHAPE, stack, sweep, voxel
 
@@ -17,15 +20,17 @@ def where():
 
 
 def test_speckle_and_unevenness_limit_the_contrast():
-    """Of 100 cells the mean scatters by 0.557 dB; unevenness is as wide as it is within a lobule, and averages over more."""
+    """Of 100 cells the mean scatters by 0.557 dB; unevenness is as wide within a lobule, and averages over more; 1 dB never."""
     volume = np.pi / 6 * 10**3
     even = detectability.features(Ball(np.ones(1), np.full(1, 100 / volume)), 0.5, Sought(10, 5.57), 0.0)
-    assert np.exp(even.detectability) == pytest.approx(10)
+    assert np.exp(even.detectability) == pytest.approx(5.57 / np.hypot(0.557, 1))
     many = Ball(np.ones(1), np.full(1, 1e9))
-    assert np.exp(detectability.features(many, 0.5, Sought(2, 6), 3.0).detectability) == pytest.approx(2, rel=1e-3)
+    assert np.exp(detectability.features(many, 0.5, Sought(2, 6), 3.0).detectability) == pytest.approx(
+        6 / np.hypot(3, 1), rel=1e-3
+    )
     lobules = volume / OBSERVER.patch_mm**3
     found = np.exp(detectability.features(many, 0.5, Sought(10, 6), 3.0).detectability)
-    assert found == pytest.approx(2 * np.sqrt(lobules), rel=1e-3)
+    assert found == pytest.approx(6 / np.hypot(3 / np.sqrt(lobules), 1), rel=1e-3)
     assert np.exp(even.resolved) == pytest.approx(10 / (2.3548 * 0.5), rel=1e-4)
 
 
@@ -67,7 +72,7 @@ def test_larger_masses_of_more_contrast_are_found_sooner(where):
             given = detectability.features(ball, where.elevational_mm[at], Sought(size, contrast), 2.0)
             table[row, column] = detectability.probability(given)
     assert (np.diff(table, axis=0) > -1e-6).all() and (np.diff(table, axis=1) > 0).all()
-    assert table[-1, -1] > 0.95 and table[0, 0] < 0.01
+    assert table[-1, -1] > 0.8 and table[0, 0] < 0.01
 
 
 def test_more_b_scans_never_lower_the_probability(rng):
@@ -106,21 +111,48 @@ def trials(rng, count=6000):
     return Features(rng.normal(2, 1, count), rng.normal(1.5, 0.5, count), unseen, (rng.random(count) < 0.3).astype(float))
 
 
+TRUE = Calibration(2.0, 0.5, Threshold(1.2, 3.0), Threshold(1.0, 4.0), Threshold(0.05, -60.0))
+
+
+def flat(calibration):
+    """All coefficients, in their order."""
+    return np.array(list(calibration.coefficients.values()))
+
+
 def test_coefficients_are_found_again(rng):
-    """Each within four of its standard errors, by the information of the trials."""
-    true, given = Calibration(-7.0, 2.5, 1.2, -30.0, -1.5), trials(rng)
-    share = detectability.probability(given, true)
+    """Each within four of its standard errors, by the information of the trials, from finite differences."""
+    given, values = trials(rng), flat(TRUE)
+    share = detectability.probability(given, TRUE)
     found = detectability.fit(given, rng.random(len(share)) < share)
-    design = np.column_stack([np.ones(len(share)), *given])
-    sigma = np.sqrt(np.diag(np.linalg.inv((design * (share * (1 - share))[:, None]).T @ design)))
-    assert (np.abs(np.subtract(found.coefficients, true.coefficients)) < 4 * sigma).all() and found.trials == len(share)
+
+    def of(values):
+        thresholds = [Threshold(*values[n : n + 2]) for n in (2, 4, 6)]
+        return detectability.probability(given, Calibration(*values[:2], *thresholds))
+
+    steps = 1e-4 * np.abs(values)
+    design = np.stack([(of(values + step) - of(values - step)) / 2 / step.sum() for step in np.diag(steps)])
+    sigma = np.sqrt(np.diag(np.linalg.inv((design / (share * (1 - share))) @ design.T)))
+    assert (np.abs(flat(found) - values) < 4 * sigma).all() and found.trials == len(share)
+    assert sigma[0] < 0.5
+
+
+def test_each_condition_has_to_hold():
+    """A mass that is seen well is found but for what nothing explains; with one condition half met, in half of these."""
+    best = Features(*(np.full(1, value) for value in (9.0, 9.0, -9.0, 0.0)))
+    assert detectability.probability(best, TRUE) == pytest.approx(expit(TRUE.dark), rel=1e-6)
+    assert detectability.probability(best._replace(bright=np.ones(1)), TRUE) == pytest.approx(
+        1 / (1 + np.exp(-TRUE.bright)), rel=1e-6
+    )
+    for name in ("detectability", "resolved", "unseen"):
+        half = best._replace(**{name: np.full(1, getattr(TRUE, name).middle)})
+        assert detectability.probability(half, TRUE) == pytest.approx(0.5 * detectability.probability(best, TRUE), rel=1e-6)
 
 
 def test_a_fit_never_rewards_a_worse_view(rng):
     """Even where trials say so by chance."""
-    given = trials(rng, 400)
-    found = detectability.fit(given, rng.random(400) < detectability.probability(given, Calibration(3.0, -1.0, -0.5, 5.0, 0.0)))
-    assert found.detectability >= 0 and found.resolved >= 0 and found.unseen <= 0
+    given, odd = trials(rng, 400), Calibration(2.0, 2.0, Threshold(1.2, -3.0), Threshold(1.0, -4.0), Threshold(0.0, 20.0))
+    found = detectability.fit(given, rng.random(400) < detectability.probability(given, odd))
+    assert found.detectability.slope >= 0 and found.resolved.slope >= 0 and found.unseen.slope <= 0
 
 
 def test_trials_that_say_nothing_are_refused(rng):
@@ -133,21 +165,23 @@ def test_trials_that_say_nothing_are_refused(rng):
 def test_trials_parted_by_a_feature_give_a_finite_fit(rng):
     given = trials(rng, 300)
     found = detectability.fit(given, given.detectability > 2)
-    assert np.isfinite(found.coefficients).all() and found.detectability > 5
+    assert np.isfinite(flat(found)).all() and found.detectability.slope > 5
+    assert found.detectability.middle == pytest.approx(2, abs=0.2)
 
 
 def test_grown_tissue_has_its_own_observer(monkeypatch):
     """A network, from the unevenness of breasts on; unless looks count always or never."""
-    grown = Calibration(constant=0.0, trials=900)
+    grown, even = replace(TRUE, trials=900), replace(TRUE, trials=0)
     monkeypatch.setattr(detectability, "GROWN", grown)
+    monkeypatch.setattr(detectability, "EVEN", even)
     for uneven_db, when, which in (
         *((0.8, "auto", "even"), (2.4, "auto", "even"), (2.6, "auto", "grown"), (np.nan, "auto", "even")),
         *((0.8, "always", "grown"), (3.4, "never", "even")),
     ):
         chosen = detectability.calibration_for(uneven_db, Looks(when))
-        assert chosen is (grown if which == "grown" else detectability.EVEN)
+        assert chosen is (grown if which == "grown" else even)
     assert detectability.source(grown.trials) == "by coefficients fitted to 900 trials"
-    assert detectability.source(detectability.EVEN.trials) == "by assumed coefficients"
+    assert detectability.source(even.trials) == "by assumed coefficients"
 
 
 def test_a_turned_world_has_the_same_map(rng):
