@@ -51,9 +51,9 @@ class SeenSoFar:
     share: float  # of the planned volume, that was seen well enough
     planned_mm3: float
     points: Map  # (n, 3) mm in the world, middles of voxels that weren't
-    seen: Map  # (n,) probability that a mass with its middle there is found, over that of one which is seen whole
+    seen: Map  # (n,) probability that a mass with its middle there is found, over what B-scans side by side give
     uneven_db: float = np.nan  # standard deviation of the tissue's power; NaN where it couldn't be measured
-    source: str = detectability.source(0)  # of the coefficients
+    source: str = detectability.source(detectability.EVEN.trials)  # of the coefficients
 
 
 @dataclass

@@ -37,7 +37,7 @@ class Observer:
     speckle_db: float = 5.57  # standard deviation of log-compressed speckle: 10/ln 10 * pi/sqrt(6)
     patch_mm: float = 3.0  # of tissue, within which its unevenness doesn't average away: lobules; assumed
     even_db: float = 0.8  # unevenness of even tissue, where it isn't known; of silicone
-    internal_db: float = 1.0  # its own noise, which no number of cells averages away
+    internal_db: float = 1.0  # its own noise, which no number of cells averages away; chosen by the trials that EVEN is fitted to
     least: float = 0.05  # of detectability, and of a size over the blur: below all are alike
     width: float = 2 * float(np.sqrt(2 * np.log(2)))  # of a blur at half its height, over its standard deviation
 
@@ -90,7 +90,7 @@ class Calibration:
 
 
 EVEN = Calibration(7.27, -0.06, Threshold(1.249, 3.11), Threshold(1.269, 9.32), Threshold(0.0347, -50.6), trials=940)
-"""Of masses that are found by their contrast; 39 silicone breasts."""
+"""Of masses that are found by their contrast; 39 silicone breasts. Bright ones by a search that left out more of them."""
 GROWN = Calibration(6.73, -5.68, Threshold(0.878, 10.6), Threshold(0.849, 4.71), Threshold(0.0249, -36.0), trials=572)
 """Of those that are found by their looks; 42 patients who keep still."""
 
@@ -207,8 +207,9 @@ def probability(given: Features, calibration: Calibration | None = None) -> Arra
     """Probability that a mass is found whole and measured; by default in even tissue."""
     chosen = calibration or EVEN
     chance = expit(np.where(np.asarray(given.bright) > 0, chosen.bright, chosen.dark))
-    for feature, passed in zip(given, (chosen.detectability, chosen.resolved, chosen.unseen), strict=False):
-        chance = chance * expit(passed.slope * (feature - passed.middle))
+    for name in Features._fields[:-1]:
+        passed: Threshold = getattr(chosen, name)
+        chance = chance * expit(passed.slope * (getattr(given, name) - passed.middle))
     return chance
 
 
@@ -230,9 +231,8 @@ def fit(given: Features, found: ArrayLike, ridge: float = 1e-3) -> Calibration:
     columns, hit = np.column_stack([np.ravel(one) for one in given]).astype(float), np.ravel(found).astype(bool)
     if len(hit) != len(columns) or not np.isfinite(columns).all():
         raise InputError(f"trials: expected finite features and whether each was found, found {columns.shape} and {len(hit)}")
-    usual = np.array(
-        [2.0, 0.0, *3 * (-0.5,), *3 * (3.0,)]
-    )  # log odds of dark and bright ones, middles, slopes towards better views
+    odds, middles, slopes = [2.0, 0.0], 3 * [-0.5], 3 * [3.0]  # usual ones: of dark and bright masses; towards better views
+    usual = np.array([*odds, *middles, *slopes])
     if len(hit) <= len(usual) or hit.all() or not hit.any():
         raise InputError(f"trials: expected more than {len(usual)}, some found and some not, found {hit.sum()} of {len(hit)}")
     seen, bright, better = columns[:, :3], columns[:, 3] > 0, np.array([1, 1, -1])
@@ -252,7 +252,7 @@ def fit(given: Features, found: ArrayLike, ridge: float = 1e-3) -> Calibration:
         return float(-np.where(hit, log_chance, log_missed).sum() + ridge * less @ less), slope + 2 * ridge * less
 
     bounds = [*2 * ((-10.0, 10.0),), *3 * ((-6.0, 6.0),), *3 * ((0.0, 100.0),)]
-    starts = [[*usual[:2], *3 * (-1.0,), *slopes] for slopes in product((2.0, 10.0), repeat=3)]  # likelihoods have several tops
+    starts = [[*odds, *middles, *each] for each in product((2.0, 10.0), repeat=3)]  # likelihoods have several tops
     fits = [minimize(misfit, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 2000}) for start in starts]
     found_at = min(fits, key=lambda one: one.fun).x
     middles, slopes = (middle + scale * found_at[2:5]).tolist(), (found_at[5:] / scale).tolist()

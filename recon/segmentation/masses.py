@@ -104,15 +104,22 @@ def from_scans(
         masses, shadows = _without_shadows(masses, power)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
-    kept, fading = list[Mass](), [mass for mass in masses if mass.bright and _fades(mass, with_shadows)]
-    for number, mass in enumerate(masses):
-        if any(mass is one for one in fading):
-            left_out.append(_left_out("its shadow hides its back", mass, power, "it fades towards its back, which isn't seen"))
-        elif any(_behind(mass, one, power) for one in fading):
-            why = "it may be the back or the shadow of a bright one that fades"
-            left_out.append(_left_out("shadow of a mass", mass, power, why))
-        elif passed(recording, grid, masses, number, sound) < LIMITS.passed:
-            left_out.append(_left_out("its shadow hides its back", mass, power, "it is dark behind it, so its back isn't seen"))
+    backless = [
+        "it fades towards its back, which isn't seen"
+        if mass.bright and _fades(mass, with_shadows)
+        else "it is dark behind it, so its back isn't seen"
+        if passed(recording, grid, masses, number, sound) < LIMITS.passed
+        else None
+        for number, mass in enumerate(masses)
+    ]
+    bright = [mass for mass, why in zip(masses, backless, strict=True) if why and mass.bright]
+    kept = list[Mass]()
+    for mass, no_back in zip(masses, backless, strict=True):
+        if no_back:
+            left_out.append(_left_out("its shadow hides its back", mass, power, no_back))
+        elif any(_behind(mass, one, power) for one in bright):
+            why = "it may be the back or the shadow of a bright one that fades, or a mass behind it"
+            left_out.append(_left_out("in the shadow of a mass", mass, power, why))
         elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
         elif even and not _stands_out(mass, power):
@@ -233,17 +240,19 @@ def _fades(mass: Mass, power: EchoPower) -> bool:
     A body that absorbs more than the tissue may be as dark as that before its back. There the power goes on falling as it did
     within, where behind a border it falls at once and then no more.
     """
-    inside_mm, behind_mm, far_mm, most = -1.0, 2.0, 6.0, 0.3  # of the border, down the beam; most slope behind over that across
-    array, beam, across = power.volume.directions.T
+    inside_mm, behind_mm, far_mm = -1.0, 2.0, 6.0  # of the border, down the beam
+    most, least = 0.3, 0.3  # slope behind over that across; nepers behind: tissue's own loss and a back's speckle make less
+    array, beam, aslant = power.volume.directions.T
     vertices, normals = np.asarray(mass.mesh.vertices), np.asarray(mass.mesh.vertex_normals)
-    aside = (vertices - mass.centre) @ np.column_stack([array, across])
+    aside = (vertices - mass.centre) @ np.column_stack([array, aslant])
     middle = ((aside / np.abs(aside).max(axis=0)) ** 2).sum(axis=1) < LIMITS.core**2  # off the sides' own shadows
     back = vertices[middle & (normals @ beam > 0.5)]
     levels = [_sampled(power, back + mm * beam) for mm in (inside_mm, behind_mm, far_mm)]
     if any(np.isfinite(level).sum() == 0 for level in levels):
         return False
-    inside, behind, far = (np.log(np.nanmean(level)) for level in levels)
-    return bool((behind - far) / (far_mm - behind_mm) > most * (inside - behind) / (behind_mm - inside_mm))
+    inside, behind, far = (np.log(max(np.nanmean(level), 1e-6)) for level in levels)
+    across, on = (inside - behind) / (behind_mm - inside_mm), (behind - far) / (far_mm - behind_mm)
+    return bool(behind - far > least and on > most * max(across, 0.0))
 
 
 def _behind(mass: Mass, other: Mass, power: EchoPower) -> bool:

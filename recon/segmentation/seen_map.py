@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 VOLUME, SURFACE, TABLE = "seen.nrrd", "unseen.ply", "seen.json"  # files
 SIZES_MM, CONTRASTS_DB = (4.0, 6.0, 8.0, 12.0, 20.0), (2.5, 5.0, 8.0, 15.0)  # of the table
-WELL = 0.5  # of the probability that there is where a mass is seen whole, from which a place counts as seen
+WELL = 0.5  # of the probability that B-scans side by side give, from which a place counts as seen
 OUTSIDE = -1  # in the volume's file: where the mass has no room, and beside what is to be scanned
 
 
@@ -91,7 +91,7 @@ class Seen:
     where: Insonation
     sought: Sought
     probability: Map  # (nz, ny, nx); 0 outside of the planned volume
-    seen: Map  # (nz, ny, nx) over the probability of a mass that is seen whole there
+    seen: Map  # (nz, ny, nx) over the probability that B-scans side by side give; beside the planned volume, too
     table: Table
 
     @property
@@ -117,7 +117,7 @@ class Seen:
     @property
     def line(self) -> str:
         """A line for the console."""
-        seen, unseen, chance = self.figures.values()
+        seen, unseen, chance = (self.figures[name] for name in ("seen_mm3", "unseen_mm3", "seen_probability"))
         what = f"a mass of {self.sought.size_mm:g} mm and {self.sought.contrast_db:g} dB"
         scanned = f"in the {(seen + unseen) / 1000:.0f} cm3 scanned, {self.table.source}"
         return f"seen        {what} is found with {100 * chance:.0f} % {scanned}; {unseen / 1000:.0f} cm3 were seen poorly"
@@ -147,16 +147,20 @@ def planned(where: Insonation, size_mm: float) -> Mask:
 
 
 def probability(where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration | None = None) -> tuple[Map, Map]:
-    """Probability : (nz, ny, nx) that a mass with its middle at each place is found, and that over one's which is seen whole."""
+    """Probability : (nz, ny, nx) that a mass in each place is found, and that over what B-scans side by side give.
+
+    Those show all of the mass, without a blur of their spacing.
+    """
     chosen, ball = calibration or detectability.calibration_for(uneven_db), detectability.ball_means(where, sought.size_mm)
-    found, whole = (
-        _probability(one, where, sought, uneven_db, chosen) for one in (ball, ball._replace(seen=np.ones_like(ball.seen)))
-    )
-    return found, found / np.maximum(whole, np.finfo(np.float32).tiny)
+    depth_mm = np.where(where.count > 0, where.depth_mm, where.under_mm)
+    slice_mm = np.fmin(where.elevational_mm, where.tally.spread.across(depth_mm))
+    found = _probability(ball, where.elevational_mm, sought, uneven_db, chosen)
+    best = _probability(ball._replace(seen=np.ones_like(ball.seen)), slice_mm, sought, uneven_db, chosen)
+    return found, found / np.maximum(best, np.finfo(np.float32).tiny)
 
 
-def _probability(ball: Ball, where: Insonation, sought: Sought, uneven_db: float, calibration: Calibration) -> Map:
-    given = detectability.features(ball, where.elevational_mm, sought, uneven_db)
+def _probability(ball: Ball, elevational_mm: Map, sought: Sought, uneven_db: float, calibration: Calibration) -> Map:
+    given = detectability.features(ball, elevational_mm, sought, uneven_db)
     return detectability.probability(given, calibration).astype(np.float32)
 
 
@@ -178,7 +182,7 @@ def look(
             detectability.ball_means(where, size),
             [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB],
         )
-        made = [_probability(ball, where, one, uneven_db, calibration) for one in several]
+        made = [_probability(ball, where.elevational_mm, one, uneven_db, calibration) for one in several]
         rows.append(tuple(float(one[scanned].mean()) if scanned.any() else 0.0 for one in made))
     there = planned(where, chosen.size_mm)
     found, seen = probability(where, chosen, uneven_db, calibration)

@@ -37,7 +37,7 @@ TABLE, SEED, TISSUE = "table.parquet", "seed", "seen.tissue"  # of a study's fol
 COLUMN = re.compile(r"pair\d+_found")
 PARTS = 4  # of the breasts, each tested by the others
 BINS = tuple((k / 10, (k + 1) / 10) for k in range(10))
-BARS = ((0.85, 0.95), (0.4, 0.6))  # places said to be seen, and doubtful ones
+BARS = ((0.4, 0.6), (0.7, 1.0))  # doubtful places, and the best
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,14 +113,18 @@ def report(tables: Iterable[Table]) -> Iterator[str]:
             continue
         part = pairs.of(chosen)
         try:
-            fitted, chance = detectability.fit(part.features, part.found), tested(part)
+            fitted = detectability.fit(part.features, part.found)
         except InputError as error:
             yield f"not fitted  to {name} tissue: {error}"
             continue
         yield f"fitted      to {part.found.size} pairs in {name} tissue, of which {part.found.sum()} were found"
         for field, value in fitted.coefficients.items():
             yield f"            {field} {value:.3f}, in use {used.coefficients[field]:g}"
-        earlier = detectability.probability(part.features, used)
+        try:
+            chance, earlier = tested(part), detectability.probability(part.features, used)
+        except InputError as error:
+            yield f"not tested  in {name} tissue: {error}"
+            continue
         for title in ("all", *np.unique(part.tissue).tolist()):
             here = (part.tissue == title) | (title == "all")
             yield from _tested(title, chance[here], earlier[here], part.found[here])

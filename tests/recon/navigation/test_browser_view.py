@@ -141,7 +141,7 @@ def test_of_port_0_it_takes_a_free_one():
 
 def test_what_is_still_to_be_scanned_is_points_that_vanish():
     """In metres, two colours; the next map takes their place, and no new map leaves them."""
-    some = SeenSoFar(0.5, 1000.0, np.array([[10, 20, 700], [13, 20, 700]], np.float32), np.array([0.1, 0.7], np.float32))
+    some = SeenSoFar(0.5, 1000.0, np.array([[10, 20, 700], [13, 20, 700]], np.float32), np.array([0.1, 0.4], np.float32))
     all_seen = SeenSoFar(1.0, 1000.0, np.empty((0, 3), np.float32), np.empty(0, np.float32))
     view = BrowserView(StillScene(np.eye(4)), 0)
     try:

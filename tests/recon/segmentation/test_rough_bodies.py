@@ -5,6 +5,7 @@ from operator import attrgetter
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import ndimage
 from scipy.special import ndtr
 
@@ -19,6 +20,11 @@ ORIGIN = CENTRE - [18.0, 14.0, 16.0]
 LOOKS = 24 * SPACING.prod()  # independent cells of speckle in a voxel
 REFINEMENTS = sum(masses.REFINEMENTS)
 PLACES = ORIGIN + SPACING * np.moveaxis(np.mgrid[: SIZE[2], : SIZE[1], : SIZE[0]][::-1], 0, -1)
+
+
+def icosphere(radius: float) -> trimesh.Trimesh:
+    """A ball."""
+    return trimesh.creation.icosphere(4, radius).apply_translation(CENTRE)
 
 
 def away(radius: float, centre=CENTRE) -> np.ndarray:
@@ -77,6 +83,8 @@ def test_a_bright_body_that_fades_into_its_shadow_has_no_back(radius, loss_db_mm
     )
     assert masses._fades(mass, power) == fades
     assert (mass.volume < 0.8 * volume_of(radius)) == fades
+    weak = speckled(tissue(radius, 2.0), rng)
+    assert not masses._fades(replace(mass, mesh=icosphere(radius)), weak), "3 dB and no loss: nothing falls behind it"
     behind, before = (replace(mass, mesh=mass.mesh.copy().apply_translation([0, mm, 0])) for mm in (6, -6))
     assert masses._behind(behind, mass, power) and not masses._behind(before, mass, power)
 
