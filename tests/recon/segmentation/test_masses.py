@@ -12,6 +12,7 @@ from recon.errors import InputError
 from recon.files.volumes import Volume
 from recon.segmentation import masses, rough_bodies
 from recon.segmentation.echo_power import EchoPower
+from recon.segmentation.left_out import UNLIKELY
 from recon.segmentation.mass_network import Looks
 from recon.segmentation.masses import refined
 from recon.segmentation.rough_bodies import rough, say
@@ -307,3 +308,24 @@ def test_a_mass_by_looks_whose_back_is_hidden_is_no_mass(rng):
     found = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks(network=BLACK))
     near = [one.reason for one in found.left_out if np.linalg.norm(np.array(one.centre_mm)[::2] - [NEAR[0], NEAR[2]]) < 3]
     assert not found.masses and near
+
+
+def test_a_bright_mass_that_fades_is_named_and_so_is_what_lies_behind_it(rng):
+    """6 dB above even tissue, and 5 dB below it at its back by its own loss; with a ball in its shadow, 8 dB darker."""
+    step, away_mm = 0.25, 0.8
+    k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
+    places = np.stack([u * step, v * step, k * away_mm])
+    bright, behind = (
+        np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) < radius
+        for centre, radius in (((20, 15, 16), 9.0), ((20, 31, 16), 3.0))
+    )
+    level = 6.0 * bright - 8.0 * behind - 0.6 * step * np.cumsum(bright, axis=1)
+    speckle = 10 * np.log10(rng.exponential(1.0, k.shape))
+    images = np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8)
+    poses = np.tile(np.diag([step, step, 1.0, 1.0]), (41, 1, 1))
+    poses[:, 2, 3] = away_mm * np.arange(41)
+    found = masses.from_scans(lambda: iter(images), (160, 160), poses)
+    assert not found.masses
+    for centre, reason in (((20, 15, 16), "its shadow hides its back"), ((20, 31, 16), "cut by the images' lower end")):
+        near = [one.reason for one in found.left_out if np.linalg.norm(np.subtract(one.centre_mm, centre)) < 4]
+        assert reason in near and reason not in UNLIKELY
