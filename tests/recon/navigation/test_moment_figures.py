@@ -41,7 +41,8 @@ def test_each_figure_stands_under_its_name():
 
 
 def test_the_share_that_was_seen_stands_last():
-    seen = SeenSoFar(0.426, 212_400.0, np.empty((0, 3), np.float32), np.empty(0, np.float32))
+    given = np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    seen = SeenSoFar(0.426, 212_400.0, *given, source="by assumed coefficients")
     told = "43 % of 212 cm³, by assumed coefficients"
     assert rows(html_of(Moment(4, 0, POSE, "target predicted", seen=seen), ()))[-1] == ["Seen", told]
     known = replace(seen, uneven_db=3.42, source="by coefficients fitted to 900 trials")
