@@ -127,10 +127,8 @@ def seen_table(table: Table) -> Section:
         for size, shares in zip(table.sizes_mm, table.shares, strict=True)
     ]
     told = "Share of what was scanned in which a mass of that size and contrast would have been found whole, had it been there, "
-    told += (
-        f"{table.source}. The layer unseen, off at first, holds places where that is less than half of what B-scans side by side "
-    )
-    told += f"give for {table.size_mm:g} mm and {table.contrast_db:g} dB, in what was scanned and beside it."
+    told += f"{table.source}. The layer unseen, off at first, holds places where that is less than half of what B-scans "
+    told += f"side by side give for {table.size_mm:g} mm and {table.contrast_db:g} dB, in what was scanned and beside it."
     return Section("Seen", [page.table(head, rows, told)])
 
 

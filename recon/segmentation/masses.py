@@ -104,14 +104,13 @@ def from_scans(
         masses, shadows = _without_shadows(masses, power)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
-    backless = [
-        "it fades towards its back, which isn't seen"
-        if mass.bright and _fades(mass, with_shadows)
-        else "it is dark behind it, so its back isn't seen"
-        if passed(recording, grid, masses, number, sound) < LIMITS.passed
-        else None
-        for number, mass in enumerate(masses)
-    ]
+    backless = list[str]()  # why a mass's back isn't seen; empty where it is
+    for number, mass in enumerate(masses):
+        if mass.bright and _fades(mass, with_shadows):
+            backless.append("it fades towards its back, which isn't seen")
+        else:
+            hidden = passed(recording, grid, masses, number, sound) < LIMITS.passed
+            backless.append("it is dark behind it, so its back isn't seen" if hidden else "")
     bright = [mass for mass, why in zip(masses, backless, strict=True) if why and mass.bright]
     kept = list[Mass]()
     for mass, no_back in zip(masses, backless, strict=True):

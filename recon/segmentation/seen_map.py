@@ -178,10 +178,8 @@ def look(
     rows = []
     for size in SIZES_MM:
         scanned = where.hull & planned(where, size)
-        ball, several = (
-            detectability.ball_means(where, size),
-            [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB],
-        )
+        ball = detectability.ball_means(where, size)
+        several = [Sought(size, contrast, chosen.bright) for contrast in CONTRASTS_DB]
         made = [_probability(ball, where.elevational_mm, one, uneven_db, calibration) for one in several]
         rows.append(tuple(float(one[scanned].mean()) if scanned.any() else 0.0 for one in made))
     there = planned(where, chosen.size_mm)

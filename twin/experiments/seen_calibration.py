@@ -2,9 +2,8 @@
 
 All breasts fit; each is tested by coefficients that were fitted to those of other parts (cross-validation), four seeds in a row
 being in one part, one of each density. Pairs in even and in grown tissue are fitted apart, as masses are found there by their
-contrast and by their looks. Intervals are of 95 %, exact binomial
-(Clopper and Pearson 1934), as if pairs were independent; those of one mass taken in several ways aren't, so they are somewhat too
-narrow.
+contrast and by their looks. Intervals are of 95 %, exact binomial (Clopper and Pearson 1934), as if pairs were independent; those
+of one mass taken in several ways aren't, so they are somewhat too narrow.
 
 python -m twin.experiments.seen_calibration outputs/seen outputs/seen_patients
 """

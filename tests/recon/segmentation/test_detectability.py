@@ -140,9 +140,7 @@ def test_each_condition_has_to_hold():
     """A mass that is seen well is found but for what nothing explains; with one condition half met, in half of these."""
     best = Features(*(np.full(1, value) for value in (9.0, 9.0, -9.0, 0.0)))
     assert detectability.probability(best, TRUE) == pytest.approx(expit(TRUE.dark), rel=1e-6)
-    assert detectability.probability(best._replace(bright=np.ones(1)), TRUE) == pytest.approx(
-        1 / (1 + np.exp(-TRUE.bright)), rel=1e-6
-    )
+    assert detectability.probability(best._replace(bright=np.ones(1)), TRUE) == pytest.approx(expit(TRUE.bright), rel=1e-6)
     for name in ("detectability", "resolved", "unseen"):
         half = best._replace(**{name: np.full(1, getattr(TRUE, name).middle)})
         assert detectability.probability(half, TRUE) == pytest.approx(0.5 * detectability.probability(best, TRUE), rel=1e-6)

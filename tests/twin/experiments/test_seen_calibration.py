@@ -70,6 +70,9 @@ def test_grown_tissue_has_coefficients_of_its_own(rng):
     lines = list(seen_calibration.report([table(rng, uneven_db=float("nan")), rows]))
     for found, true in zip(printed(lines), (TRUE, looks), strict=True):
         assert found[2] == pytest.approx(true.detectability.middle, abs=0.25)
+        assert found[4] == pytest.approx(true.resolved.middle, abs=0.25) and found[6] == pytest.approx(
+            true.unseen.middle, abs=0.02
+        )
     *_, few = seen_calibration.report([[rows[0]]])
     assert few.startswith("not tested  in grown tissue: trials: expected more than 8")
 
