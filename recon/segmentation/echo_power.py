@@ -4,6 +4,7 @@ Speckle's power averages to the tissue's backscatter, its grey levels don't: the
 small, by the width of pulse and beam spilling into it. So grey levels are turned back into power before they are averaged.
 """
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -92,20 +93,24 @@ def averaged(
     tissue_grey: float,
     dynamic_range_db: float = 60.0,
     clip: Clip | None = None,
+    gel: Map | None = None,
 ) -> EchoPower:
     """Average the power of B-scans : n times (h, w) uint8, log-compressed, on a grid.
 
     `tissue_grey` is the median level of tissue, which gets a mean power of 1. A `clip` should leave out the ringing at the face.
+    `gel` : (n, w) is the factor by which gel brightens each column.
     """
     table = powers(tissue_grey, dynamic_range_db)
 
-    def place(image: NDArray) -> Placed:
+    def place(scan: tuple[NDArray, Map | float]) -> Placed:
+        image, brightening = scan
         left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
-        power = table[image[top : bottom + 1, left : right + 1]]
+        power = (table[image] / brightening)[top : bottom + 1, left : right + 1]
         return Placed(power, np.ones_like(power), u, v)
 
-    return accumulated(threads.mapped(place, images), world_from_pixel, grid)
+    scans = zip(images, itertools.repeat(np.float32(1)) if gel is None else gel, strict=gel is not None)
+    return accumulated(threads.mapped(place, scans), world_from_pixel, grid)
 
 
 def powers(tissue_grey: float, dynamic_range_db: float = 60.0) -> Map:

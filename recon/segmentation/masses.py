@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from recon import arguments, threads
 from recon.errors import InputError
-from recon.freehand.volume_compounding import Clip, grid_of
+from recon.freehand.volume_compounding import Clip, Grid, grid_of
 from recon.geometry import rigid
-from recon.segmentation import blur_correction, border_fit, echo_power, mass_network
+from recon.segmentation import blur_correction, border_fit, echo_power, gel, mass_network
 from recon.segmentation.blur_correction import Blur, Planes
 from recon.segmentation.echo_power import EchoPower, pixel_mm
 from recon.segmentation.left_out import LeftOut, Reason
@@ -81,8 +81,10 @@ def from_scans(
     grey = tissue_grey(images(), shape, world_from_pixel) if grey is None else grey
     grid = echo_power.beam_grid(world_from_pixel, shape, SPACING_MM, clip)
     spread_mm = blur.lateral_mm if blur else 0.0
-    recording = Recording(images, world_from_pixel, echo_power.powers(grey, dynamic_range_db), clip, spread_mm)
-    power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip)
+    table = echo_power.powers(grey, dynamic_range_db)
+    brightening = gel.brightening(images, world_from_pixel, table, clip.v)
+    recording = Recording(images, world_from_pixel, table, clip, spread_mm, brightening)
+    power = echo_power.averaged(images(), world_from_pixel, grid, grey, dynamic_range_db, clip, brightening)
     roughly = 1  # refinement of the surface, as exact as clearing needs it
     with_shadows = power
     begun = rough(power)
@@ -90,38 +92,33 @@ def from_scans(
     looks = looks or Looks()
     if looks.sees(begun.uneven_db):
         return _by_looks(recording, begun, power, sound, looks.network)
-    bright = faint(power, [], begun.hidden, signs=(1,)).masses if even else []
+    bright = faint(power, [], begun, signs=(1,)).masses if even else []
     masses, left_out = refined([*begun.masses, *bright], power, roughly), list[LeftOut]()
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses, shadows = _without_shadows(masses, power)
             masses, left_out = refined(masses, power, times), left_out + shadows
-    more = faint(power, masses, begun.hidden) if even else Found([], [])
+    more = faint(power, masses, begun) if even else Found([], [])
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
         masses, shadows = _without_shadows(masses, power)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
-    backless = list[str]()  # why a mass's back isn't seen; empty where it is
-    for number, mass in enumerate(masses):
-        if mass.bright and _fades(mass, with_shadows):
-            backless.append("it fades towards its back, which isn't seen")
-        else:
-            hidden = passed(recording, grid, masses, number, sound) < LIMITS.passed
-            backless.append("it is dark behind it, so its back isn't seen" if hidden else "")
-    bright = [mass for mass, why in zip(masses, backless, strict=True) if why and mass.bright]
+    no_back = [_no_back(recording, grid, masses, number, sound, with_shadows) for number in range(len(masses))]
+    backless = [mass for mass, why in zip(masses, no_back, strict=True) if why]
     kept = list[Mass]()
-    for mass, no_back in zip(masses, backless, strict=True):
-        if no_back:
-            left_out.append(_left_out("its shadow hides its back", mass, power, no_back))
-        elif any(_behind(mass, one, power) for one in bright):
-            why = "it may be the back or the shadow of a bright one that fades, or a mass behind it"
+    for mass, why in zip(masses, no_back, strict=True):
+        others = [other for other in masses if other is not mass]
+        if why:
+            left_out.append(_left_out("its shadow hides its back", mass, power, why))
+        elif any(_behind(mass, one, power) for one in backless):
+            why = "it may be the back or the shadow of one whose back isn't seen, or a mass behind it"
             left_out.append(_left_out("in the shadow of a mass", mass, power, why))
-        elif any(_hides(*pair, power) for other in masses if other is not mass for pair in ((mass, other), (other, mass))):
+        elif any(_hides(*pair, power) for other in others for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
-        elif even and not _stands_out(mass, power):
+        elif even and not all(_stands_out(mass, field) for field in ((power, with_shadows) if mass.bright else (power,))):
             left_out.append(_left_out("weak contrast", mass, power, "it hardly differs from the tissue around"))
         else:
             kept.append(mass)
@@ -152,14 +149,15 @@ def _by_looks(recording: Recording, begun: Rough, power: EchoPower, sound: Sound
         reason: Reason = "looks like tissue" if share < LOOK.denied else "unsure"
         text = f"a dark body of {dark.volume_mm3:.0f} mm3 at {in_words(dark.centre_mm)} mm is left out: {LOOK_WAYS[reason]}"
         left_out.append(dark.model_copy(update={"reason": reason, "text": text}))
+    with_shadows = power
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses = refined(masses, power, times)
     kept = list[Mass]()
     for number, mass in enumerate(masses):
-        if not mass.bright and passed(recording, grid, masses, number, sound) < LIMITS.passed:
-            left_out.append(_left_out("its shadow hides its back", mass, power, "it is dark behind it, so its back isn't seen"))
+        if not mass.bright and (why := _no_back(recording, grid, masses, number, sound, with_shadows)):
+            left_out.append(_left_out("its shadow hides its back", mass, power, why))
         else:
             kept += parted(mass, power.volume.directions)
     say(left_out)
@@ -233,6 +231,28 @@ def _stands_out(mass: Mass, power: EchoPower) -> bool:
     return (whole < 0) == mass.bright and min(step / whole for step in each) > 0.5
 
 
+def _no_back(recording: Recording, grid: Grid, masses: Sequence[Mass], number: int, sound: Sound, power: EchoPower) -> str:
+    """Why the back of one of the masses isn't told from its shadow, in power with shadows; empty where it is.
+
+    Behind a back the power changes at once, and then little. A mass that absorbs much may be as dark there as the tissue, if it
+    is bright, or its shadow as dark as itself.
+    """
+    mass = masses[number]
+    behind = passed(recording, grid, masses, number, sound)
+    if mass.bright:
+        if _fades(mass, power):
+            return "it fades towards its back, which isn't seen"
+        hidden = behind < LIMITS.passed
+    else:
+        core, inside_mm = _sampled(power, _core(mass)), -4.0  # of the back: beyond the blur of the border, and lobes of it
+        own = float(np.nanmedian(core)) if np.isfinite(core).any() else 0.0
+        deep_mm = float(np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions[:, 1]))
+        if deep_mm > -2 * inside_mm and _about_back(mass, power, [inside_mm])[0] > LIMITS.within * max(own, LIMITS.clutter):
+            return "it grows brighter towards its back, which isn't told from its shadow"
+        hidden = behind < LIMITS.passed + LIMITS.own * own
+    return "it is dark behind it, so its back isn't seen" if hidden else ""
+
+
 def _fades(mass: Mass, power: EchoPower) -> bool:
     """Whether a bright mass fades into its own shadow instead of ending at a border, in power with shadows.
 
@@ -241,17 +261,20 @@ def _fades(mass: Mass, power: EchoPower) -> bool:
     """
     inside_mm, behind_mm, far_mm = -1.0, 2.0, 6.0  # of the border, down the beam
     most, least = 0.3, 0.3  # slope behind over that across; nepers behind: tissue's own loss and a back's speckle make less
+    inside, behind, far = np.log(np.maximum(_about_back(mass, power, [inside_mm, behind_mm, far_mm]), 1e-6))
+    across, on = (inside - behind) / (behind_mm - inside_mm), (behind - far) / (far_mm - behind_mm)
+    return bool(behind - far > least and on > most * max(across, 0.0))
+
+
+def _about_back(mass: Mass, power: EchoPower, deeper_mm: Sequence[float]) -> Array:
+    """Mean power some way down the beam from the middle of a mass's back, off its sides' own shadows; NaN where none is seen."""
     array, beam, aslant = power.volume.directions.T
     vertices, normals = np.asarray(mass.mesh.vertices), np.asarray(mass.mesh.vertex_normals)
     aside = (vertices - mass.centre) @ np.column_stack([array, aslant])
-    middle = ((aside / np.abs(aside).max(axis=0)) ** 2).sum(axis=1) < LIMITS.core**2  # off the sides' own shadows
+    middle = ((aside / np.abs(aside).max(axis=0)) ** 2).sum(axis=1) < LIMITS.core**2
     back = vertices[middle & (normals @ beam > 0.5)]
-    levels = [_sampled(power, back + mm * beam) for mm in (inside_mm, behind_mm, far_mm)]
-    if any(np.isfinite(level).sum() == 0 for level in levels):
-        return False
-    inside, behind, far = (np.log(max(np.nanmean(level), 1e-6)) for level in levels)
-    across, on = (inside - behind) / (behind_mm - inside_mm), (behind - far) / (far_mm - behind_mm)
-    return bool(behind - far > least and on > most * max(across, 0.0))
+    levels = (_sampled(power, back + mm * beam) for mm in deeper_mm)
+    return np.array([np.nanmean(level) if np.isfinite(level).any() else np.nan for level in levels])
 
 
 def _behind(mass: Mass, other: Mass, power: EchoPower) -> bool:

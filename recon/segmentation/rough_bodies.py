@@ -50,6 +50,9 @@ class MassLimits:
     still: float = 0.5  # of power in its core at most, after the shadows of others are cleared
     told: int = 8  # of what is left out for one reason, that are said; all are listed
     passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
+    own: float = 1.5  # of a dark mass's own power, by which it is more; with less its back was found mm too deep
+    within: float = 2.0  # of its own power just before its back, at most: else it ends before, and its shadow hangs on to it
+    clutter: float = 0.01  # of power in fluid, at least
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 
 
@@ -100,8 +103,10 @@ class FaintLimits:
     core_db: float = 2.8  # of contrast in its middle
     beside_mm: float = 2.0  # of masses, where shadows and borders are left over
     least_mm3: float = 80.0
+    told_mm3: float = 40.0  # of smaller ones that are named
     behind: float = 0.5  # share of tissue in what lies behind it: else it may be what the tissue lies on
     behind_mm: float = 5.0  # of that
+    thick_mm: float = 6.0  # of a bright body that the scan cuts: skin, and what the tissue lies on, are thinner
 
 
 @dataclass(frozen=True)
@@ -148,7 +153,7 @@ class Rough(NamedTuple):
     masses: list[Mass]
     left_out: list[LeftOut]
     uneven_db: float  # standard deviation of the tissue's power; from FAINT.even_db on, no faint ones are told from it
-    hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones
+    hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones, but for those behind masses
     gap: Mask  # voxels that no B-scan shows, with B-scans on both sides
 
 
@@ -198,7 +203,8 @@ def rough(power: EchoPower) -> Rough:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), ratio[one.part], 1.0)
             masses.append(Mass(meshed(field, (1 + one.core) / 2, one.part, power.volume)))
             kept.append(one)
-    return Rough(masses, left_out, uneven_db, shadowed | (dark & ~_mask(kept, dark.shape)), gap)
+    in_shadow = np.logical_or.accumulate(_mask(kept, dark.shape), axis=1)  # which will be cleared
+    return Rough(masses, left_out, uneven_db, shadowed | (dark & ~in_shadow), gap)
 
 
 def say(left_out: Sequence[LeftOut]) -> None:
@@ -211,18 +217,18 @@ def say(left_out: Sequence[LeftOut]) -> None:
             log.info("%d more are left out: %s", len(alike) - LIMITS.told, reason)
 
 
-def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[int, ...] = (-1, 1)) -> Found:
+def faint(power: EchoPower, masses: Sequence[Mass], begun: Rough, signs: tuple[int, ...] = (-1, 1)) -> Found:
     """Bodies little darker than even tissue around, or brighter, in power without the shadows of the masses that are known.
 
     What is left out isn't logged.
 
     Parameters
     ----------
-    hidden : voxels where none are looked for, as of `rough`
+    begun : of a search for dark bodies; none are looked for where it says that they are hidden
     signs : -1 for darker ones, 1 for brighter ones
     """
     spacing, volume = power.volume.spacing[::-1], power.volume
-    free = ~hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
+    free = ~begun.hidden & (distances(masses, grid_of(volume)).voxels > FAINT.beside_mm)
     smooth = _smooth(volume.voxels, power.weight * free, FAINT.smooth_mm / spacing)
     seen = np.isfinite(_smooth(volume.voxels, power.weight, LIMITS.smooth_mm / spacing))
     known = seen & free & np.isfinite(smooth)
@@ -239,8 +245,11 @@ def faint(power: EchoPower, masses: Sequence[Mass], hidden: Mask, signs: tuple[i
     found, left_out = list[Mass](), list[LeftOut]()
     for sign in signs:
         bodies, edge = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
+        left_out += [_leave_out("small", one, power) for one in bodies if FAINT.told_mm3 <= one.volume and not _counts(one)]
         bodies, edge = ([one for one in several if _counts(one)] for several in (bodies, edge))
-        left_out += [_leave_out("at the scan's edge", one, power) for one in edge]
+        for one in edge:
+            thick = sign > 0 and _thickness(one.inside, spacing) > FAINT.thick_mm
+            left_out.append(_leave_out(_cut_by(one, seen, begun.gap, spacing) if thick else "at the scan's edge", one, power))
         for one in bodies:
             field = np.where(_widen(one.inside, LIMITS.grow_mm, spacing), -sign * contrast[one.part], 0.0)
             if _is_streak(one, spacing):
@@ -428,7 +437,8 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
             text = f"a body is {reason}, and is left out: {place}, {along:.0f} x {deep:.0f} x {across:.0f} mm; "
             text += CUT_WAYS.get(reason, "scan on there")
         case _:
-            text = f"a dark body of {place} is left out: it is too small to be measured, or told from a shadow or uneven tissue"
+            text = f"a {'bright' if one.core > 1 else 'dark'} body of {place} is left out: "
+            text += "it is too small to be measured, or told from a shadow or uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text)
 
 
@@ -517,7 +527,8 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         inside, here = labels[part] == number, known[part]
         volume = inside.sum() * float(np.prod(spacing))
         along, height, across = extents = _extents(box, spacing)
-        small = volume < CUT.least_mm3 or height < CUT.least_mm or height > LIMITS.streak * max(along, across)
+        tall = height > LIMITS.streak * max(along, across)
+        small = volume < CUT.least_mm3 or height < CUT.least_mm
         if small or np.quantile(ratio[part][inside], CUT.darkest) > LIMITS.seed or whole[part][inside].mean() > CUT.same:
             continue
         shell, behind = _widen(inside, 2 * LIMITS.edge_mm, spacing) & ~inside, np.logical_or.accumulate(inside, axis=1)
@@ -533,8 +544,11 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         covered = among if not covered else (front & bright[part]).sum() >= CUT.mostly * front.sum()
         if not any(sides.values()) or not covered:
             continue
-        ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
         middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
+        if tall:
+            left_out += _shadows_to_the_end(inside, unseen, middle, power)
+            continue
+        ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
         centre = _middle(inside, middle, power)
         if ends and (beside & ~here).sum() > (1 - CUT.mostly) * beside.sum():
             reason: Reason = "behind the tissue"
@@ -552,6 +566,22 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
         below = np.pad(near, ((0, 0), (0, dark.shape[1] - part[1].start - near.shape[1]), (0, 0)))
         shadowed[part[0], part[1].start :, part[2]] |= np.logical_or.accumulate(below, axis=1)
     return left_out, shadowed[pad:-pad, pad:-pad, pad:-pad]
+
+
+def _shadows_to_the_end(inside: Mask, unseen: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
+    """A body whose shadow reaches the images' lower end, from a dark column in a part of the volume; none if it doesn't."""
+    spacing, thick = power.volume.spacing[::-1], _thickness(inside, power.volume.spacing[::-1])
+    sides = cut_sides(unseen, np.zeros_like(unseen))
+    if thick < CUT.least_mm or max(sides, key=lambda name: sides[name]) != "cut by the images' lower end":
+        return []
+    first = int(np.flatnonzero(inside.any(axis=(0, 2)))[0])
+    front = inside & (np.arange(inside.shape[1]) < first + thick / spacing[1])[:, None]
+    along, deep, across = _extents(ndimage.find_objects(front.astype(int))[0], spacing)
+    centre = _middle(front, part, power)
+    text = f"a dark body at {in_words(centre)} mm, {along:.0f} x {across:.0f} mm wide, is left out: "
+    text += "its shadow reaches the images' lower end, so its back isn't seen"
+    volume, why = front.sum() * float(np.prod(spacing)), "its shadow hides its back"
+    return [LeftOut(reason=why, volume_mm3=volume, centre_mm=centre, extents_mm=(along, deep, across), text=text)]
 
 
 def cut_sides(unseen: Mask, gap: Mask) -> dict[Reason, int]:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 from scipy import ndimage
 from scipy.special import ndtr
 
@@ -14,6 +15,7 @@ from recon.segmentation import masses, rough_bodies
 from recon.segmentation.echo_power import EchoPower
 from recon.segmentation.left_out import UNLIKELY
 from recon.segmentation.mass_network import Looks
+from recon.segmentation.mass_surface import Mass
 from recon.segmentation.masses import refined
 from recon.segmentation.rough_bodies import rough, say
 
@@ -289,7 +291,8 @@ def grown_scans(rng, shadow=False):
 def test_in_grown_tissue_looks_tell_masses(rng, caplog):
     """One ball is found and measured, by its border's fit; the other looks like tissue to the network, and is listed so, once.
 
-    By power alone both are masses. What is said is listed. Lobules that touch the border, half as dark, move it by up to 0.3 mm.
+    By power alone both are bodies, the first with a lobule on its back, so that it is named. What is said is listed. Lobules that
+    touch the border, half as dark, move it by up to 0.3 mm.
     """
     images, poses = grown_scans(rng)
     found = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks(network=BLACK))
@@ -300,7 +303,8 @@ def test_in_grown_tissue_looks_tell_masses(rng, caplog):
     assert denied.reason == "looks like tissue"
     assert {one.text for one in found.left_out} >= set(caplog.messages)
     without = masses.from_scans(lambda: iter(images), (160, 160), poses, looks=Looks("never"))
-    assert len(without.masses) == 2
+    (far,), (near,) = without.masses, (one for one in without.left_out if one.reason == "its shadow hides its back")
+    assert np.linalg.norm(far.centre - FAR) < 1 and np.linalg.norm(np.array(near.centre_mm) - NEAR) < 2
 
 
 def test_a_mass_by_looks_whose_back_is_hidden_is_no_mass(rng):
@@ -310,22 +314,71 @@ def test_a_mass_by_looks_whose_back_is_hidden_is_no_mass(rng):
     assert not found.masses and near
 
 
-def test_a_bright_mass_that_fades_is_named_and_so_is_what_lies_behind_it(rng):
-    """6 dB above even tissue, and 5 dB below it at its back by its own loss; with a ball in its shadow, 8 dB darker."""
+def ball_scans(rng, first, first_db, loss_db_mm, second, second_db):
+    """B-scans (160, 160) 0.8 mm apart of even tissue with two balls : x, y, z, radius, of which the first absorbs; poses."""
     step, away_mm = 0.25, 0.8
     k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
     places = np.stack([u * step, v * step, k * away_mm])
-    bright, behind = (
-        np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) < radius
-        for centre, radius in (((20, 15, 16), 9.0), ((20, 31, 16), 3.0))
+    within, behind = (
+        np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) < radius for *centre, radius in (first, second)
     )
-    level = 6.0 * bright - 8.0 * behind - 0.6 * step * np.cumsum(bright, axis=1)
+    level = first_db * within + second_db * behind - loss_db_mm * step * np.cumsum(within, axis=1)
     speckle = 10 * np.log10(rng.exponential(1.0, k.shape))
     images = np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8)
     poses = np.tile(np.diag([step, step, 1.0, 1.0]), (41, 1, 1))
     poses[:, 2, 3] = away_mm * np.arange(41)
+    return images, poses
+
+
+def reasons_near(left_out, centre):
+    """Of what is left out within 4 mm of a place."""
+    return [one.reason for one in left_out if np.linalg.norm(np.subtract(one.centre_mm, centre)) < 4]
+
+
+def test_a_bright_mass_that_fades_is_named_and_so_is_what_lies_behind_it(rng):
+    """6 dB above even tissue, and 5 dB below it at its back by its own loss; with a ball in its shadow, 8 dB darker."""
+    images, poses = ball_scans(rng, (20, 15, 16, 9.0), 6.0, 0.6, (20, 31, 16, 3.0), -8.0)
     found = masses.from_scans(lambda: iter(images), (160, 160), poses)
     assert not found.masses
     for centre, reason in (((20, 15, 16), "its shadow hides its back"), ((20, 31, 16), "cut by the images' lower end")):
-        near = [one.reason for one in found.left_out if np.linalg.norm(np.subtract(one.centre_mm, centre)) < 4]
-        assert reason in near and reason not in UNLIKELY
+        assert reason in reasons_near(found.left_out, centre) and reason not in UNLIKELY
+
+
+@pytest.mark.parametrize(("loss_db_mm", "found_behind"), [(0.0, True), (0.5, True), (0.8, False)])
+def test_a_mass_in_the_shadow_of_another_is_found_or_named(loss_db_mm, found_behind, rng):
+    """Both 14 dB below even tissue. A third of the power comes through the first; a sixth, in which one of 6 mm is small."""
+    first, second = (20.0, 12.0, 16.0), (20.0, 26.0, 16.0)
+    images, poses = ball_scans(rng, (*first, 5.0), -14.0, loss_db_mm, (*second, 3.0), -14.0)
+    found = masses.from_scans(lambda: iter(images), (160, 160), poses)
+    places = [mass.centre for mass in found.masses]
+    assert len(places) == 1 + found_behind and np.linalg.norm(places[0] - first) < 0.3
+    assert (reasons_near(found.left_out, second) == ["small"]) != found_behind
+
+
+def test_a_mass_that_lets_nothing_through_is_named(rng):
+    """Its shadow is as dark as itself to the images' end."""
+    place = (20.0, 12.0, 16.0)
+    images, poses = ball_scans(rng, (*place, 5.0), -14.0, 1.6, (20, 20, 16, 0.0), 0.0)
+    found = masses.from_scans(lambda: iter(images), (160, 160), poses)
+    (told,) = found.left_out
+    assert not found.masses and told.reason == "its shadow hides its back" and "the images' lower end" in told.text
+    assert np.linalg.norm(np.subtract(told.centre_mm, place)) < 1 and told.extents_mm == pytest.approx((10, 10, 10), abs=1.5)
+
+
+def test_a_body_that_is_brighter_towards_its_back_has_its_shadow_on_it(monkeypatch):
+    """Of the ball come 5 % of tissue's power, of its shadow 20 %. What comes through must exceed 1.5 of its own, and more."""
+    mean, distance = ball()
+    places = grid() - CENTRE
+    shadow = (np.hypot(places[..., 0], places[..., 2]) < RADIUS) & (places[..., 1] > 0) & (distance > 0)
+    power = EchoPower(Volume(np.where(shadow, 0.2, mean).astype(np.float32), ORIGIN, SPACING), np.ones(mean.shape, np.float32))
+    whole = trimesh.creation.icosphere(4, RADIUS)
+    with_shadow = whole.copy()
+    with_shadow.vertices[with_shadow.vertices[:, 1] > 0] *= [1, 2, 1]
+
+    def why(mesh, through):
+        monkeypatch.setattr(masses, "passed", lambda *_: through)
+        return masses._no_back(None, None, [Mass(mesh.copy().apply_translation(CENTRE))], 0, None, power)
+
+    assert why(whole, 0.2) == ""
+    assert why(whole, 0.15).startswith("it is dark behind it")
+    assert why(with_shadow, 0.5).startswith("it grows brighter towards its back")

@@ -61,7 +61,7 @@ def test_a_bright_and_a_faint_ball_are_as_large_as_they_are(level, rng):
     power = speckled(tissue(5.0, level), rng)
     first = rough_bodies.rough(power)
     assert even(first) and not first.masses
-    (found,) = rough_bodies.faint(power, [], first.hidden).masses
+    (found,) = rough_bodies.faint(power, [], first).masses
     assert found.bright == (level > 1)
     (mass,) = masses.refined([found], power, REFINEMENTS)
     assert mass.volume == pytest.approx(volume_of(5.0), rel=0.06 if level > 1 else 0.12)
@@ -78,7 +78,7 @@ def test_a_bright_body_that_fades_into_its_shadow_has_no_back(radius, loss_db_mm
     power = speckled(tissue(radius, 4.0) * 10 ** (-loss_db_mm * way_mm / 10), rng)
     first = rough_bodies.rough(power)
     mass = max(
-        masses.refined(rough_bodies.faint(power, [], first.hidden, signs=(1,)).masses, power, REFINEMENTS),
+        masses.refined(rough_bodies.faint(power, [], first, signs=(1,)).masses, power, REFINEMENTS),
         key=attrgetter("volume"),
     )
     assert masses._fades(mass, power) == fades
@@ -93,7 +93,7 @@ def test_even_tissue_alone_holds_nothing(rng):
     power = speckled(np.ones(PLACES.shape[:3]), rng)
     first = rough_bodies.rough(power)
     assert even(first) and not first.masses and not first.left_out
-    assert rough_bodies.faint(power, [], first.hidden)[:2] == ([], [])
+    assert rough_bodies.faint(power, [], first)[:2] == ([], [])
 
 
 def test_a_body_of_weak_contrast_is_found_in_even_tissue_and_named_in_uneven(rng):
@@ -154,7 +154,7 @@ def test_what_is_bright_with_nothing_behind_it_is_what_the_tissue_lies_on(rng):
     table = (places[..., 1] > 8) & (places[..., 1] < 14) & (np.abs(places[..., 0]) < 9) & (np.abs(places[..., 2]) < 9)
     mean = np.where(table, 4.0, np.where(places[..., 1] >= 14, 0.02, 1.0))
     power = speckled(mean, rng)
-    found = rough_bodies.faint(power, [], rough_bodies.rough(power).hidden)
+    found = rough_bodies.faint(power, [], rough_bodies.rough(power))
     assert not found.masses and [one.reason for one in found.left_out] == ["behind the tissue"]
 
 
@@ -171,11 +171,23 @@ def test_unseen_and_black_depths_leave_even_tissue_even(rng):
     assert even(rough_bodies.rough(speckled(np.where(places[..., 1] > 2, 0.0, 1.0), rng)))
 
 
-def test_a_bright_body_at_the_scans_end_is_listed(rng):
+def test_a_bright_body_that_the_scan_cuts_is_named_and_a_bright_layer_at_its_end_is_listed(rng):
+    """Such a layer is skin, or what the tissue lies on: hardly a mass, and said without a warning."""
     last = int((CENTRE[2] - ORIGIN[2] + 1.0) / SPACING[2])
-    power = speckled(tissue(5.0, 4.0)[:last], rng)
-    found = rough_bodies.faint(power, [], rough_bodies.rough(power).hidden)
-    assert not found.masses and [one.reason for one in found.left_out] == ["at the scan's edge"]
+    layer = np.where(PLACES[..., 1] > PLACES[..., 1].max() - 4, 4.0, 1.0)
+    for mean, reason in ((tissue(5.0, 4.0)[:last], "cut by the sweep's end"), (layer, "at the scan's edge")):
+        power = speckled(mean, rng)
+        found = rough_bodies.faint(power, [], rough_bodies.rough(power))
+        assert not found.masses and [one.reason for one in found.left_out] == [reason]
+
+
+@pytest.mark.parametrize(("radius", "told"), [(2.8, True), (1.5, False)])
+def test_a_faint_body_too_small_to_be_measured_is_named(radius, told, rng):
+    """4 dB above the tissue, of 92 and 14 mm3, less of which is seen so bright."""
+    power = speckled(tissue(radius, 2.5), rng)
+    found = rough_bodies.faint(power, [], rough_bodies.rough(power))
+    assert not found.masses and [one.reason for one in found.left_out] == told * ["small"]
+    assert all("a bright body" in one.text for one in found.left_out)
 
 
 def begun(gap=None) -> rough_bodies.Rough:

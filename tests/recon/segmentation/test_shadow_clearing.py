@@ -48,7 +48,8 @@ def recording(planes) -> Recording:
         power = light * ~lines.inside
         decibels = 10 * np.log10(np.maximum(power, 1e-9) / echo_power.MEDIAN_OF_MEAN)
         images.append(np.clip(np.rint(GREY + decibels * 255 / 60), 0, 255).astype(np.uint8))
-    return Recording(lambda: iter(images), planes, echo_power.powers(GREY), Clip(0, 0, *SHAPE), SPREAD_MM)
+    gel = np.ones((PLANES, SIDE), np.float32)
+    return Recording(lambda: iter(images), planes, echo_power.powers(GREY), Clip(0, 0, *SHAPE), SPREAD_MM, gel)
 
 
 def shells(power):
