@@ -93,23 +93,24 @@ def averaged(
     tissue_grey: float,
     dynamic_range_db: float = 60.0,
     clip: Clip | None = None,
-    gel: Map | None = None,
+    brightening: Map | None = None,
 ) -> EchoPower:
     """Average the power of B-scans : n times (h, w) uint8, log-compressed, on a grid.
 
     `tissue_grey` is the median level of tissue, which gets a mean power of 1. A `clip` should leave out the ringing at the face.
-    `gel` : (n, w) is the factor by which gel brightens each column.
+    `brightening` : (n, w) of each column, as of `recon.segmentation.gel`, is taken off.
     """
     table = powers(tissue_grey, dynamic_range_db)
 
     def place(scan: tuple[NDArray, Map | float]) -> Placed:
-        image, brightening = scan
+        image, factor = scan
         left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
-        power = (table[image] / brightening)[top : bottom + 1, left : right + 1]
+        power = (table[image] / factor)[top : bottom + 1, left : right + 1]
         return Placed(power, np.ones_like(power), u, v)
 
-    scans = zip(images, itertools.repeat(np.float32(1)) if gel is None else gel, strict=gel is not None)
+    factors = itertools.chain([] if brightening is None else brightening, itertools.repeat(1))
+    scans = zip(images, factors, strict=False)
     return accumulated(threads.mapped(place, scans), world_from_pixel, grid)
 
 

@@ -106,17 +106,12 @@ def from_scans(
         masses, shadows = _without_shadows(masses, power)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
-    no_back = [_no_back(recording, grid, masses, number, sound, with_shadows) for number in range(len(masses))]
-    backless = [mass for mass, why in zip(masses, no_back, strict=True) if why]
+    masses, hidden = _with_backs(recording, grid, masses, power, with_shadows, sound)
+    left_out += hidden
     kept = list[Mass]()
-    for mass, why in zip(masses, no_back, strict=True):
+    for mass in masses:
         others = [other for other in masses if other is not mass]
-        if why:
-            left_out.append(_left_out("its shadow hides its back", mass, power, why))
-        elif any(_behind(mass, one, power) for one in backless):
-            why = "it may be the back or the shadow of one whose back isn't seen, or a mass behind it"
-            left_out.append(_left_out("in the shadow of a mass", mass, power, why))
-        elif any(_hides(*pair, power) for other in others for pair in ((mass, other), (other, mass))):
+        if any(_hides(*pair, power) for other in others for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
         elif even and not all(_stands_out(mass, field) for field in ((power, with_shadows) if mass.bright else (power,))):
             left_out.append(_left_out("weak contrast", mass, power, "it hardly differs from the tissue around"))
@@ -154,12 +149,9 @@ def _by_looks(recording: Recording, begun: Rough, power: EchoPower, sound: Sound
         if masses:
             power = cleared(recording, grid, masses, sound)
             masses = refined(masses, power, times)
-    kept = list[Mass]()
-    for number, mass in enumerate(masses):
-        if not mass.bright and (why := _no_back(recording, grid, masses, number, sound, with_shadows)):
-            left_out.append(_left_out("its shadow hides its back", mass, power, why))
-        else:
-            kept += parted(mass, power.volume.directions)
+    masses, hidden = _with_backs(recording, grid, masses, power, with_shadows, sound)
+    left_out += hidden
+    kept = [part for mass in masses for part in parted(mass, power.volume.directions)]
     say(left_out)
     return Found(sorted(kept, key=lambda mass: -mass.volume), left_out, begun.uneven_db)
 
@@ -231,26 +223,53 @@ def _stands_out(mass: Mass, power: EchoPower) -> bool:
     return (whole < 0) == mass.bright and min(step / whole for step in each) > 0.5
 
 
+def _with_backs(
+    recording: Recording, grid: Grid, masses: Sequence[Mass], power: EchoPower, with_shadows: EchoPower, sound: Sound
+) -> tuple[list[Mass], list[LeftOut]]:
+    """Masses but for those whose backs aren't told from their shadows, and those behind such; and these."""
+    why = [_no_back(recording, grid, masses, number, sound, with_shadows) for number in range(len(masses))]
+    backless = [mass for mass, reason in zip(masses, why, strict=True) if reason]
+    kept, left_out = list[Mass](), list[LeftOut]()
+    for mass, reason in zip(masses, why, strict=True):
+        if reason:
+            left_out.append(_left_out("its shadow hides its back", mass, power, reason))
+        elif any(_behind(mass, one, power) for one in backless):
+            reason = "it may be the back or the shadow of one whose back isn't seen, or a mass behind it"
+            left_out.append(_left_out("in the shadow of a mass", mass, power, reason))
+        else:
+            kept.append(mass)
+    return kept, left_out
+
+
 def _no_back(recording: Recording, grid: Grid, masses: Sequence[Mass], number: int, sound: Sound, power: EchoPower) -> str:
     """Why the back of one of the masses isn't told from its shadow, in power with shadows; empty where it is.
 
-    Behind a back the power changes at once, and then little. A mass that absorbs much may be as dark there as the tissue, if it
-    is bright, or its shadow as dark as itself.
+    A mass that absorbs much may be as dark before its back as the tissue, if it is bright; a dark one's shadow as dark as itself.
     """
     mass = masses[number]
-    behind = passed(recording, grid, masses, number, sound)
     if mass.bright:
         if _fades(mass, power):
             return "it fades towards its back, which isn't seen"
-        hidden = behind < LIMITS.passed
-    else:
-        core, inside_mm = _sampled(power, _core(mass)), -4.0  # of the back: beyond the blur of the border, and lobes of it
-        own = float(np.nanmedian(core)) if np.isfinite(core).any() else 0.0
-        deep_mm = float(np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions[:, 1]))
-        if deep_mm > -2 * inside_mm and _about_back(mass, power, [inside_mm])[0] > LIMITS.within * max(own, LIMITS.clutter):
-            return "it grows brighter towards its back, which isn't told from its shadow"
-        hidden = behind < LIMITS.passed + LIMITS.own * own
-    return "it is dark behind it, so its back isn't seen" if hidden else ""
+    elif any(_brightens(part, power) for part in parted(mass, power.volume.directions)):
+        return "it grows brighter towards its back, which isn't told from its shadow"
+    own = 0.0 if mass.bright else _own(mass, power)
+    if passed(recording, grid, masses, number, sound) < LIMITS.passed + LIMITS.own * own:
+        return "it is dark behind it, so its back isn't seen"
+    return ""
+
+
+def _own(mass: Mass, power: EchoPower) -> float:
+    """Median power in a mass's middle; 0 where none is seen."""
+    core = _sampled(power, _core(mass))
+    return float(np.nanmedian(core)) if np.isfinite(core).any() else 0.0
+
+
+def _brightens(mass: Mass, power: EchoPower) -> bool:
+    """Whether a dark mass ends before its back, in power with shadows: then its shadow, a little brighter, hangs on to it."""
+    inside_mm = -4.0  # of the back: beyond the blur of its border, and its lobes; less deep masses are too small to tell
+    deep_mm = float(np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions[:, 1]))
+    inside = _about_back(mass, power, [inside_mm])[0]
+    return bool(deep_mm > -3 * inside_mm and inside > LIMITS.within * max(_own(mass, power), LIMITS.clutter))
 
 
 def _fades(mass: Mass, power: EchoPower) -> bool:

@@ -51,8 +51,8 @@ class MassLimits:
     told: int = 8  # of what is left out for one reason, that are said; all are listed
     passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
     own: float = 1.5  # of a dark mass's own power, by which it is more; with less its back was found mm too deep
-    within: float = 2.0  # of its own power just before its back, at most: else it ends before, and its shadow hangs on to it
-    clutter: float = 0.01  # of power in fluid, at least
+    within: float = 1.4  # of its own power 4 mm before its back, at most: else it ends before, and its shadow hangs on to it
+    clutter: float = 0.01  # of power, at least, of which that is a multiple
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 
 
@@ -153,7 +153,7 @@ class Rough(NamedTuple):
     masses: list[Mass]
     left_out: list[LeftOut]
     uneven_db: float  # standard deviation of the tissue's power; from FAINT.even_db on, no faint ones are told from it
-    hidden: Mask  # voxels of dark bodies that are left out, and those in the shadows of cut ones, but for those behind masses
+    hidden: Mask  # voxels of dark bodies that are left out, if no mass is before them, and those in the shadows of cut ones
     gap: Mask  # voxels that no B-scan shows, with B-scans on both sides
 
 
@@ -245,7 +245,9 @@ def faint(power: EchoPower, masses: Sequence[Mass], begun: Rough, signs: tuple[i
     found, left_out = list[Mass](), list[LeftOut]()
     for sign in signs:
         bodies, edge = _bodies(_opened(sign * contrast > FAINT.least_db, LIMITS.open_mm, spacing), contrast, seen, spacing)
-        left_out += [_leave_out("small", one, power) for one in bodies if FAINT.told_mm3 <= one.volume and not _counts(one)]
+        for one in bodies:
+            if not _counts(one) and one.volume >= FAINT.told_mm3:
+                left_out.append(_leave_out("small" if one.volume < FAINT.least_mm3 else "weak contrast", one, power))
         bodies, edge = ([one for one in several if _counts(one)] for several in (bodies, edge))
         for one in edge:
             thick = sign > 0 and _thickness(one.inside, spacing) > FAINT.thick_mm
@@ -437,8 +439,7 @@ def _leave_out(reason: Reason, one: Candidate, power: EchoPower) -> LeftOut:
             text = f"a body is {reason}, and is left out: {place}, {along:.0f} x {deep:.0f} x {across:.0f} mm; "
             text += CUT_WAYS.get(reason, "scan on there")
         case _:
-            text = f"a {'bright' if one.core > 1 else 'dark'} body of {place} is left out: "
-            text += "it is too small to be measured, or told from a shadow or uneven tissue"
+            text = f"a body of {place} is left out: it is too small to be measured, or told from a shadow or uneven tissue"
     return LeftOut(reason=reason, volume_mm3=one.volume, centre_mm=centre, extents_mm=extents, text=text)
 
 
@@ -546,7 +547,9 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
             continue
         middle = tuple(slice(s.start - pad, s.stop - pad) for s in part)
         if tall:
-            left_out += _shadows_to_the_end(inside, unseen, middle, power)
+            to_end = max(sides, key=lambda name: sides[name]) == "cut by the images' lower end"
+            if to_end and _thickness(inside, spacing) >= CUT.least_mm:
+                left_out.append(_shadow_to_the_end(inside, middle, power))
             continue
         ends = (inside & last[part]).any(axis=1).sum() > (1 - CUT.mostly) * inside.any(axis=1).sum()
         centre = _middle(inside, middle, power)
@@ -568,20 +571,22 @@ def _cut_bodies(dark: Mask, whole: Mask, ratio: NDArray, seen: Mask, gap: Mask, 
     return left_out, shadowed[pad:-pad, pad:-pad, pad:-pad]
 
 
-def _shadows_to_the_end(inside: Mask, unseen: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
-    """A body whose shadow reaches the images' lower end, from a dark column in a part of the volume; none if it doesn't."""
-    spacing, thick = power.volume.spacing[::-1], _thickness(inside, power.volume.spacing[::-1])
-    sides = cut_sides(unseen, np.zeros_like(unseen))
-    if thick < CUT.least_mm or max(sides, key=lambda name: sides[name]) != "cut by the images' lower end":
-        return []
+def _shadow_to_the_end(inside: Mask, part: Part, power: EchoPower) -> LeftOut:
+    """What is told of a body whose shadow reaches the images' lower end, from a dark column in a part of the volume."""
+    spacing = power.volume.spacing[::-1]
     first = int(np.flatnonzero(inside.any(axis=(0, 2)))[0])
-    front = inside & (np.arange(inside.shape[1]) < first + thick / spacing[1])[:, None]
-    along, deep, across = _extents(ndimage.find_objects(front.astype(int))[0], spacing)
-    centre = _middle(front, part, power)
+    front = inside & (np.arange(inside.shape[1]) < first + _thickness(inside, spacing) / spacing[1])[:, None]
+    extents, volume = _extents(ndimage.find_objects(front.astype(int))[0], spacing), front.sum() * float(np.prod(spacing))
+    return _hidden_back(_middle(front, part, power), extents, volume, "the images' lower end")
+
+
+def _hidden_back(centre: Place, extents: Place, volume: float, end: str) -> LeftOut:
+    """What is told of a body of which a shadow without an end is seen."""
+    along, _, across = extents
     text = f"a dark body at {in_words(centre)} mm, {along:.0f} x {across:.0f} mm wide, is left out: "
-    text += "its shadow reaches the images' lower end, so its back isn't seen"
-    volume, why = front.sum() * float(np.prod(spacing)), "its shadow hides its back"
-    return [LeftOut(reason=why, volume_mm3=volume, centre_mm=centre, extents_mm=(along, deep, across), text=text)]
+    text += f"its shadow reaches {end}, so its back isn't seen"
+    why: Reason = "its shadow hides its back"
+    return LeftOut(reason=why, volume_mm3=volume, centre_mm=centre, extents_mm=extents, text=text)
 
 
 def cut_sides(unseen: Mask, gap: Mask) -> dict[Reason, int]:
@@ -612,11 +617,8 @@ def _bumps(behind: Mask, part: Part, power: EchoPower) -> list[LeftOut]:
         places = np.array([i.mean() + part[2].start, row + part[1].start, k.mean() + part[0].start])
         x, y, z = rigid.apply(power.volume.world_from_voxel, places).tolist()
         deep = float(np.median(front[columns]) - front[k, i].min())
-        text = f"a dark body at {x:.0f}, {y:.0f}, {z:.0f} mm, {along:.0f} x {across:.0f} mm wide, is left out: "
-        text += "its shadow reaches the dark behind the tissue, so its back isn't seen"
-        extents, volume = (along, deep, across), float(behind[k, :, i].sum() * np.prod(spacing))
-        why: Reason = "its shadow hides its back"
-        found.append(LeftOut(reason=why, volume_mm3=volume, centre_mm=(x, y, z), extents_mm=extents, text=text))
+        volume = float(behind[k, :, i].sum() * np.prod(spacing))
+        found.append(_hidden_back((x, y, z), (along, deep, across), volume, "the dark behind the tissue"))
     return found
 
 

@@ -35,7 +35,7 @@ class Recording:
     table: Map  # (256,) power of each grey level
     clip: Clip
     spread_mm: float  # sigma of an echo's power along the array; shadows have no sharper edges
-    gel: Map  # (n, w) factor by which gel brightens each column, as of `recon.segmentation.gel`
+    brightening: Map  # (n, w) factor by which gel brightens each column, as of `recon.segmentation.gel`
 
 
 def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sound) -> EchoPower:
@@ -46,16 +46,16 @@ def cleared(recording: Recording, grid: Grid, masses: Sequence[Mass], sound: Sou
 
     most_loss = 0.05  # of power left: darker pixels are left out
 
-    def place(image: NDArray[np.uint8], matrix: Array, gel: Map) -> Placed:
+    def place(image: NDArray[np.uint8], matrix: Array, brightening: Map) -> Placed:
         if not np.isfinite(matrix).all():
             return Placed(*4 * (table[image],))  # counts nothing
         lines = follow(inside, scale, matrix, image.shape, sound)
         rows = np.arange(image.shape[0], dtype=np.float32)[:, None] * scale[1]
         light = ndimage.gaussian_filter(lines.passed * np.exp(-by_path * lines.within), (0, recording.spread_mm / scale[0]))
-        power = np.where(light > most_loss, table[image] / gel * np.exp(by_depth * rows), np.nan)
+        power = np.where(light > most_loss, table[image] / brightening * np.exp(by_depth * rows), np.nan)
         return Placed(*(field[top:].astype(np.float32) for field in (power, light, lines.u, lines.v)))
 
-    placed = threads.mapped(place, recording.images(), recording.world_from_pixel, recording.gel)
+    placed = threads.mapped(place, recording.images(), recording.world_from_pixel, recording.brightening)
     return echo_power.accumulated(placed, recording.world_from_pixel, grid)
 
 
@@ -71,17 +71,17 @@ def _losses(recording: Recording, inside: Volume, sound: Sound) -> tuple[float, 
     clear_mm = 2.0  # from a border, where pixels show one tissue only
 
     def binned(scan: tuple[NDArray[np.uint8], Array, Map]) -> tuple[NDArray[np.int64], Array]:
-        image, matrix, gel = scan
+        image, matrix, brightening = scan
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         u, v, within, passed = (a[rows] for a in (lines.u, lines.v, lines.within, lines.passed))
-        power = table[image[rows, ::thinned]] / gel[::thinned]
+        power = table[image[rows, ::thinned]] / brightening[::thinned]
         away = _sample(inside, matrix, u, v)
         used = (away > clear_mm) & (away < FAR_MM - 0.2) & (passed > 0.5)
         bins = np.minimum(v[used] * scale[1], DEPTH_BINS - 1).astype(int) * PATH_BINS
         return bins + np.minimum(within[used], PATH_BINS - 1).astype(int), power[used] / passed[used]
 
     total, count = np.zeros((2, DEPTH_BINS * PATH_BINS))
-    scans = zip(recording.images(), recording.world_from_pixel, recording.gel, strict=True)
+    scans = zip(recording.images(), recording.world_from_pixel, recording.brightening, strict=True)
     placed = (scan for scan in scans if np.isfinite(scan[1]).all())
     for bins, power in threads.mapped(binned, placed):
         total += np.bincount(bins, power, len(total))
@@ -100,15 +100,15 @@ def passed(recording: Recording, grid: Grid, masses: Sequence[Mass], number: int
     rows = slice(recording.clip.v, None, thinned)
 
     def near(scan: tuple[NDArray[np.uint8], Array, Map]) -> Array:
-        image, matrix, gel = scan
+        image, matrix, brightening = scan
         lines = follow(inside, scale, matrix, image.shape, sound, thinned)
         away, apart = (_sample(field, matrix, lines.u[rows], lines.v[rows]) for field in (inside, others))
-        power, around = table[image[rows, ::thinned]] / gel[::thinned], (away > near_mm[0]) & (away < near_mm[1])
+        power, around = table[image[rows, ::thinned]] / brightening[::thinned], (away > near_mm[0]) & (away < near_mm[1])
         around &= apart > near_mm[0]
         behind, beside = around & (lines.within[rows] > least_mm), around & (lines.within[rows] == 0)
         return np.stack([field.sum(axis=1) for field in (power * behind, behind, power * beside, beside)])
 
-    scans = zip(recording.images(), recording.world_from_pixel, recording.gel, strict=True)
+    scans = zip(recording.images(), recording.world_from_pixel, recording.brightening, strict=True)
     sums = sum(threads.mapped(near, (scan for scan in scans if np.isfinite(scan[1]).all())), np.zeros(1))
     behind, count, beside, free = sums[:, (sums[1] > 0) & (sums[2] > 0)]  # rows with both
     return float(behind.sum() / (count * beside / free).sum()) if len(count) else np.inf

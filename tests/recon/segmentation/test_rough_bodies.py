@@ -187,7 +187,6 @@ def test_a_faint_body_too_small_to_be_measured_is_named(radius, told, rng):
     power = speckled(tissue(radius, 2.5), rng)
     found = rough_bodies.faint(power, [], rough_bodies.rough(power))
     assert not found.masses and [one.reason for one in found.left_out] == told * ["small"]
-    assert all("a bright body" in one.text for one in found.left_out)
 
 
 def begun(gap=None) -> rough_bodies.Rough:

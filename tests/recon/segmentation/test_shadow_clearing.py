@@ -48,8 +48,8 @@ def recording(planes) -> Recording:
         power = light * ~lines.inside
         decibels = 10 * np.log10(np.maximum(power, 1e-9) / echo_power.MEDIAN_OF_MEAN)
         images.append(np.clip(np.rint(GREY + decibels * 255 / 60), 0, 255).astype(np.uint8))
-    gel = np.ones((PLANES, SIDE), np.float32)
-    return Recording(lambda: iter(images), planes, echo_power.powers(GREY), Clip(0, 0, *SHAPE), SPREAD_MM, gel)
+    no_gel = np.ones((PLANES, SIDE), np.float32)
+    return Recording(lambda: iter(images), planes, echo_power.powers(GREY), Clip(0, 0, *SHAPE), SPREAD_MM, no_gel)
 
 
 def shells(power):
@@ -95,3 +95,18 @@ def test_what_comes_through_a_mass_is_measured_behind_it(recording, planes):
     for image in images:
         image[row:, round((CENTRE[0] - RADIUS) / PIXEL_MM) : round((CENTRE[0] + RADIUS) / PIXEL_MM)] = 0
     assert shadow_clearing.passed(replace(recording, images=lambda: iter(images)), grid, [ball(RADIUS)], 0, SOUND) < 0.1
+
+
+def test_columns_behind_gel_count_as_if_there_were_none(recording, planes):
+    """Half of them are brighter by 26 grey levels, which are taken off: what is cleared, and what comes through, stays."""
+    grid, levels, half = echo_power.beam_grid(planes, SHAPE, SPACING_MM), 26, SIDE // 2
+    images = [image.astype(int) for image in recording.images()]
+    for image in images:
+        image[:, :half] += levels * (image[:, :half] > 0)
+    factor = np.ones((PLANES, SIDE), np.float32)
+    factor[:, :half] = 10 ** (levels * 60 / 255 / 10)
+    gelled = replace(recording, images=lambda: iter([image.astype(np.uint8) for image in images]), brightening=factor)
+    plain, same = (shadow_clearing.cleared(one, grid, [ball(RADIUS)], SOUND) for one in (recording, gelled))
+    np.testing.assert_allclose(same.volume.voxels, plain.volume.voxels, rtol=0.01, atol=0.002)
+    through, again = (shadow_clearing.passed(one, grid, [ball(RADIUS)], 0, SOUND) for one in (recording, gelled))
+    assert again == pytest.approx(through, rel=0.005)
