@@ -90,7 +90,8 @@ class Calibration:
 
 
 EVEN = Calibration(7.27, -0.06, Threshold(1.249, 3.11), Threshold(1.269, 9.32), Threshold(0.0347, -50.6), trials=940)
-"""Of masses that are found by their contrast; 39 silicone breasts. Bright ones by a search that left out more of them."""
+"""Of masses that are found by their contrast; 39 silicone breasts, by a search that left out more bright ones, and
+measured more that shadow."""
 GROWN = Calibration(6.73, -5.68, Threshold(0.878, 10.6), Threshold(0.849, 4.71), Threshold(0.0249, -36.0), trials=572)
 """Of those that are found by their looks; 42 patients who keep still."""
 

@@ -106,10 +106,10 @@ def averaged(
         image, factor = scan
         left, right, top, bottom = (clip or Clip(0, 0, image.shape[1], image.shape[0])).bounds(image.shape)
         v, u = np.mgrid[top : bottom + 1, left : right + 1].astype(np.float32)
-        power = (table[image] / factor)[top : bottom + 1, left : right + 1]
+        power = table[image[top : bottom + 1, left : right + 1]] / np.broadcast_to(factor, image.shape[1])[left : right + 1]
         return Placed(power, np.ones_like(power), u, v)
 
-    factors = itertools.chain([] if brightening is None else brightening, itertools.repeat(1))
+    factors = itertools.chain([] if brightening is None else brightening, itertools.repeat(np.float32(1)))
     scans = zip(images, factors, strict=False)
     return accumulated(threads.mapped(place, scans), world_from_pixel, grid)
 

@@ -268,8 +268,9 @@ def _brightens(mass: Mass, power: EchoPower) -> bool:
     """Whether a dark mass ends before its back, in power with shadows: then its shadow, a little brighter, hangs on to it."""
     inside_mm = -4.0  # of the back: beyond the blur of its border, and its lobes; less deep masses are too small to tell
     deep_mm = float(np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions[:, 1]))
-    inside = _about_back(mass, power, [inside_mm])[0]
-    return bool(deep_mm > -3 * inside_mm and inside > LIMITS.within * max(_own(mass, power), LIMITS.clutter))
+    if deep_mm <= -3 * inside_mm:
+        return False
+    return bool(_about_back(mass, power, [inside_mm])[0] > LIMITS.within * max(_own(mass, power), LIMITS.clutter))
 
 
 def _fades(mass: Mass, power: EchoPower) -> bool:
@@ -312,8 +313,7 @@ def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:
     aside, size = (np.abs(one @ np.column_stack([array, across])) for one in (away, own))
     if mass.bright or other.bright or away @ beam <= 0 or gap >= near_mm or (aside >= size.max(axis=0)).any():
         return False
-    core = _sampled(power, _core(mass))
-    return bool(np.isfinite(core).any() and np.median(core[np.isfinite(core)]) > LIMITS.seed)
+    return _own(mass, power) > LIMITS.seed
 
 
 def _core(mass: Mass) -> Array:

@@ -269,23 +269,34 @@ BLACK = SimpleNamespace(run=lambda _, given: [40 * (0.2 - ndimage.gaussian_filte
 """stands in for the network: a mass is what is nearly black"""
 
 
+PIXEL_MM, APART_MM = 0.25, 0.8  # of 41 B-scans (160, 160)
+
+
+def scan_places():
+    """Places of the pixels of B-scans side by side : (3, 41, 160, 160) mm."""
+    k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
+    return np.stack([u * PIXEL_MM, v * PIXEL_MM, k * APART_MM])
+
+
+def speckled_scans(level, rng):
+    """B-scans of tissue of a level : (41, 160, 160) dB, and their poses."""
+    speckle = 10 * np.log10(rng.exponential(1.0, level.shape))
+    poses = np.tile(np.diag([PIXEL_MM, PIXEL_MM, 1.0, 1.0]), (len(level), 1, 1))
+    poses[:, 2, 3] = APART_MM * np.arange(len(level))
+    return np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8), poses
+
+
 def grown_scans(rng, shadow=False):
     """B-scans (160, 160) 0.8 mm apart of lobules 8 dB apart, with both balls in them, and their poses."""
-    step = 0.25
-    k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
-    places = np.stack([u * step, v * step, k * 0.8])
-    level = 4 * np.sign(ndimage.gaussian_filter(rng.standard_normal(k.shape), (2, 7, 7)))
+    places = scan_places()
+    level = 4 * np.sign(ndimage.gaussian_filter(rng.standard_normal(places.shape[1:]), (2, 7, 7)))
     for centre, radius, depth in ((NEAR, 5.0, -30.0), (FAR, 4.0, -14.0)):
         away = np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) - radius
         level = np.where(away < 0, depth, level)
     if shadow:
         beside = np.hypot(places[0] - NEAR[0], places[2] - NEAR[2])
         level = np.where((beside < 5) & (places[1] > NEAR[1]), -30.0, level)
-    speckle = 10 * np.log10(rng.exponential(1.0, k.shape))
-    images = np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8)
-    poses = np.tile(np.diag([step, step, 1.0, 1.0]), (41, 1, 1))
-    poses[:, 2, 3] = 0.8 * np.arange(41)
-    return images, poses
+    return speckled_scans(level, rng)
 
 
 def test_in_grown_tissue_looks_tell_masses(rng, caplog):
@@ -314,18 +325,12 @@ def test_a_mass_by_looks_whose_back_is_hidden_is_no_mass(rng):
 
 def ball_scans(rng, first, first_db, loss_db_mm, second, second_db):
     """B-scans (160, 160) 0.8 mm apart of even tissue with two balls : x, y, z, radius, of which the first absorbs; poses."""
-    step, away_mm = 0.25, 0.8
-    k, v, u = np.mgrid[:41, :160, :160].astype(np.float32)
-    places = np.stack([u * step, v * step, k * away_mm])
+    places = scan_places()
     within, behind = (
         np.linalg.norm(places - np.reshape(centre, (3, 1, 1, 1)), axis=0) < radius for *centre, radius in (first, second)
     )
-    level = first_db * within + second_db * behind - loss_db_mm * step * np.cumsum(within, axis=1)
-    speckle = 10 * np.log10(rng.exponential(1.0, k.shape))
-    images = np.clip(140 + 255 / 60 * (level + speckle), 0, 255).astype(np.uint8)
-    poses = np.tile(np.diag([step, step, 1.0, 1.0]), (41, 1, 1))
-    poses[:, 2, 3] = away_mm * np.arange(41)
-    return images, poses
+    level = first_db * within + second_db * behind - loss_db_mm * PIXEL_MM * np.cumsum(within, axis=1)
+    return speckled_scans(level, rng)
 
 
 def reasons_near(left_out, centre):
