@@ -266,11 +266,11 @@ def _own(mass: Mass, power: EchoPower) -> float:
 
 def _brightens(mass: Mass, power: EchoPower) -> bool:
     """Whether a dark mass ends before its back, in power with shadows: then its shadow, a little brighter, hangs on to it."""
-    inside_mm = -4.0  # of the back: beyond the blur of its border, and its lobes; less deep masses are too small to tell
+    inside_mm = -6.0, -5.0, -4.0  # of the back: beyond the blur of its border, and its lobes
     deep_mm = float(np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions[:, 1]))
-    if deep_mm <= -3 * inside_mm:
-        return False
-    return bool(_about_back(mass, power, [inside_mm])[0] > LIMITS.within * max(_own(mass, power), LIMITS.clutter))
+    if deep_mm <= -2 * min(inside_mm):
+        return False  # too small to tell
+    return bool(_about_back(mass, power, inside_mm).mean() > LIMITS.within * max(_own(mass, power), LIMITS.clutter))
 
 
 def _fades(mass: Mass, power: EchoPower) -> bool:

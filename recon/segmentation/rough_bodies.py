@@ -51,7 +51,7 @@ class MassLimits:
     told: int = 8  # of what is left out for one reason, that are said; all are listed
     passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
     own: float = 1.5  # of a dark mass's own power, by which it is more; with less its back was found mm too deep
-    within: float = 1.4  # of its own power 4 mm before its back, at most: else it ends before, and its shadow hangs on to it
+    within: float = 1.25  # of its own power 4 to 6 mm before its back, at most: else its shadow hangs on to it
     clutter: float = 0.01  # of power, at least, of which that is a multiple
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 

@@ -29,6 +29,8 @@ from recon.segmentation.tube_wall import Appearance, Ring, Tube
 Array = NDArray[np.float64]
 
 OVERLAYS = 4
+DOUBTED = 0.12  # of a mass's volume, from which on twice its standard deviation is warned of
+VOLUME_WARNING = "warning     volume:"
 COVER = ("cover_diameter_mm", "cover_rms_mm", "cover_wall_mm", "cover_wall_sigma_mm")  # figures
 
 
@@ -99,6 +101,7 @@ def find_masses(
         if moved is not None:
             figures[f"mass{number}_left_sigma_mm"] = sigma.left_mm
             lines += rest.warnings_of(f"mass{number}", sigma.left_mm)
+        lines += doubts(f"mass{number}", mass, sigma)
     drawn = scan_overlays.of_masks(scans.stream(), masses.shown(found, placed, scans.shape, sound), overlays)
     return Segmented({f"mass{k}": mass.mesh for k, mass in enumerate(found)}, figures, lines, drawn, tuple(left_out), scans)
 
@@ -117,6 +120,12 @@ def measure(name: str, mass: Mass, sigma: Sigma, under: Containment | None) -> M
         figures |= {f"{name}_inside": inside, f"{name}_covered": under.covered, f"{name}_depth_mm": under.least_mm}
         figures[f"{name}_depth_sigma_mm"] = sigma.depth_mm
     return figures
+
+
+def doubts(name: str, mass: Mass, sigma: Sigma) -> list[str]:
+    """A warning, where a mass's volume is hardly known."""
+    share = 2 * sigma.volume_mm3 / mass.volume
+    return [f"{VOLUME_WARNING} {name}'s is known to {100 * share:.0f} % only (2 sigma)"] if share > DOUBTED else []
 
 
 def describe(mass: Mass, sigma: Sigma, under: Containment | None) -> str:

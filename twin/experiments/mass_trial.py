@@ -21,10 +21,12 @@ from recon.geometry.surface_tree import signed_distances
 from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES
 from recon.segmentation.left_out import UNLIKELY, LeftOut
+from recon.segmentation.segmented_scans import DOUBTED, VOLUME_WARNING
 from recon.session import masses_step
 from scenes.acoustics import TISSUES
 from scenes.scene_types import Thing
 from twin.evaluation import sweep_errors
+from twin.evaluation.sweep_errors import Finding
 from twin.experiments import mass_conditions
 from twin.experiments.experiment_runs import Experiment, Settings
 from twin.experiments.mass_conditions import CONDITIONS, Condition
@@ -52,6 +54,7 @@ class Judgement:
     centre_mm: float = 0.6
     volume: float = 0.12  # of its own
     near_mm: float = 2.0  # from a mass to the place of what is left out
+    sigmas: float = 3.0  # of a volume of which it is warned
 
 
 LIMITS = Judgement()
@@ -63,6 +66,7 @@ class Findings:
 
     masses: Sequence[trimesh.Trimesh]
     sigmas_mm: Sequence[float]  # of their centres
+    volume_sigmas_mm3: Sequence[float]
     left_out: Sequence[LeftOut]
     doubted: bool  # whether contact or motion is warned of, which concerns all masses
     axes: Array  # (3, 3) of array and beam, and across the B-scans, in columns
@@ -82,9 +86,10 @@ def measure(settings: Settings, seed: int) -> Metrics:
         found = masses_step.find(scans, masses_step.Method(overlays=0), skin)
     shown = [thing for thing in hidden if seen(planned, inner_points(thing.mesh), kept).any()]
     sigmas = [found.figures[f"{name}_centre_sigma_mm"] for name in found.meshes]
-    doubted = any(line.startswith("warning") for line in found.lines)
+    volume_sigmas = [found.figures[f"{name}_volume_sigma_mm3"] for name in found.meshes]
+    doubted = any(line.startswith("warning") and not line.startswith(VOLUME_WARNING) for line in found.lines)
     told = [one for one in found.left_out if one.reason not in UNLIKELY]
-    said = Findings(list(found.meshes.values()), sigmas, told, doubted, axes(scans))
+    said = Findings(list(found.meshes.values()), sigmas, volume_sigmas, told, doubted, axes(scans))
     return judge(shown, said) | {"contact_mm": found.figures.get("contact_mm", np.nan)}
 
 
@@ -188,6 +193,7 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
     volumes = [float(abs(pair.found.volume / pair.true.volume - 1)) for pair in here if pair.found is not None]
     right = sum(centre <= LIMITS.centre_mm and volume <= LIMITS.volume for centre, volume in zip(centres, volumes, strict=True))
     off = len(here) - right
+    told = 0 if said.doubted else sum(_volume_is_doubted(pair, said.volume_sigmas_mm3[pair.number]) for pair in here)
     named = sum(any(names(one, pair.true, said.axes) for one in said.left_out) for pair in pairs if pair.found is None)
     taken = {pair.number for pair in here}
     false = [mass for number, mass in enumerate(said.masses) if number not in taken]
@@ -198,7 +204,7 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
         "masses_true": len(hidden),
         "masses_right": right,
         "masses_off": off,
-        "masses_off_warned": off if said.doubted else 0,
+        "masses_off_warned": off if said.doubted else told,
         "masses_named": named,
         "masses_silent": len(hidden) - len(here) - named,
         "masses_false": len(false),
@@ -210,6 +216,15 @@ def judge(hidden: Sequence[Thing], said: Findings) -> Metrics:
         "worst_volume_error_percent": 100 * max(volumes) if here else np.nan,
         "centre_error_over_sigma": float(np.mean(over)) if here else np.nan,
     }
+
+
+def _volume_is_doubted(pair: Finding, sigma_mm3: float) -> bool:
+    """Whether a mass is off by its volume alone, of which it is warned, and by no more than that."""
+    assert pair.found is not None
+    off = float(abs(pair.found.volume - pair.true.volume))
+    allowed = LIMITS.volume * float(pair.true.volume)
+    warned = 2 * sigma_mm3 > DOUBTED * float(pair.found.volume)
+    return pair.centre_error_mm <= LIMITS.centre_mm and allowed < off <= LIMITS.sigmas * sigma_mm3 and warned
 
 
 def names(one: LeftOut, mass: trimesh.Trimesh, axes: Array) -> bool:

@@ -194,3 +194,13 @@ def test_b_scans_between_the_same_poses_err_together(rig, sharp):
     errors = PlaceErrors(poses, np.full((count, 2), 0.5), nothing, np.zeros((count, 4, 4)))
     sigma = mass_uncertainty.by_all(mass, replace(scans, errors=errors), STILL)
     assert sigma.centre_mm == pytest.approx(0.1 * np.sqrt(3 / 2), rel=0.01)
+
+
+def test_the_volume_of_a_small_body_is_known_less_well(rig):
+    """By its border's place, which below 6 mm of radius is uncertain in inverse proportion to that; the centre isn't."""
+    scans, _ = sweep(probe_of(rig, np.zeros((8, 8))))
+    for radius, outwards in ((12.0, 0.06), (6.0, 0.06), (2.0, 0.18)):
+        ball = trimesh.creation.icosphere(4, radius)
+        sigma = mass_uncertainty.by_all(Mass(ball), scans, STILL)
+        assert sigma.volume_mm3 == pytest.approx(outwards * ball.area, rel=0.01)
+        assert sigma.centre_mm == pytest.approx(np.sqrt(3) * 0.06, rel=0.01)

@@ -26,6 +26,14 @@ def test_whether_a_mass_is_inside_may_be_unknown():
     assert np.isnan(figures["mass0_inside"]) and figures["mass0_covered"] == pytest.approx(0.48, abs=0.01)
 
 
+def test_a_volume_that_is_hardly_known_has_a_warning():
+    """Where its uncertainty isn't known, none is doubted."""
+    mass = Mass(trimesh.creation.icosphere(3, 3.0))
+    for share, warned in ((0.065, True), (0.055, False), (np.nan, False)):
+        lines = segmented_scans.doubts("mass2", mass, Sigma(0.1, share * mass.volume))
+        assert lines == (["warning     volume: mass2's is known to 13 % only (2 sigma)"] if warned else [])
+
+
 def test_a_skin_of_unknown_uncertainty_is_named_beside_the_depth():
     """A depth below it has no standard deviation, where one below a skin of none beside the border's has."""
     mass = Mass(trimesh.creation.icosphere(radius=3))

@@ -37,9 +37,10 @@ def left_out(centre, extents=(0.0, 0.0, 0.0), reason="weak contrast") -> LeftOut
     return LeftOut(reason=reason, volume_mm3=100.0, centre_mm=centre, extents_mm=extents, text="")
 
 
-def judged(*masses: trimesh.Trimesh, left=(), doubted: bool = False):
+def judged(*masses: trimesh.Trimesh, left=(), doubted: bool = False, volume_sigmas=()):
     """Counts above zero by their short names, but for that of the true ones, which is two."""
-    figures = mass_trial.judge(TRUE, Findings(masses, [0.1] * len(masses), left, doubted, AXES))
+    found = Findings(masses, [0.1] * len(masses), volume_sigmas or [1.0] * len(masses), left, doubted, AXES)
+    figures = mass_trial.judge(TRUE, found)
     assert figures["masses_true"] == 2
     ends = ("right", "off", "named", "silent")
     assert sum(figures[f"masses_{end}"] for end in ends) == 2
@@ -62,7 +63,7 @@ def test_found_masses_are_right_or_off(shift, larger, counted):
 
 def test_errors_are_those_of_what_was_found():
     """One of two is found, 0.3 mm off, a tenth too large, with a standard deviation of its centre of 0.2 mm."""
-    found = Findings([ball(LARGE, (0.0, 0.3, 0.0), 1.1)], [0.2], [], False, AXES)
+    found = Findings([ball(LARGE, (0.0, 0.3, 0.0), 1.1)], [0.2], [1.0], [], False, AXES)
     figures = mass_trial.judge(TRUE, found)
     assert figures["centre_error_mm"] == figures["worst_centre_error_mm"] == pytest.approx(0.3, abs=1e-6)
     assert figures["volume_error_percent"] == pytest.approx(10, abs=1e-6)
@@ -75,6 +76,17 @@ def test_masses_that_are_off_are_warned_of_by_a_warning_of_all():
     moved = ball(LARGE, (0.0, 0.0, 2.0))
     assert judged(ball(SMALL), moved) == {"right": 1, "off": 1}
     assert judged(ball(SMALL), moved, doubted=True) == {"right": 1, "off": 1, "off_warned": 1}
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "larger", "sigma", "warned"),
+    [(0.0, 0.86, 0.065, True), (0.0, 0.7, 0.065, False), (0.0, 0.86, 0.04, False), (0.7, 0.86, 0.065, False)],
+)
+def test_a_mass_whose_volume_is_said_to_be_uncertain_is_warned_of(shift_mm, larger, sigma, warned):
+    """If it is off by no more than three sigma, and its centre is right; a volume known to 8 % (2 sigma) has no warning."""
+    small = ball(SMALL, (shift_mm, 0.0, 0.0), larger)
+    counts = judged(ball(LARGE), small, volume_sigmas=[1.0, sigma * small.volume])
+    assert counts == {"right": 1, "off": 1} | ({"off_warned": 1} if warned else {})
 
 
 @pytest.mark.parametrize(("beyond_mm", "named"), [(-8.0, True), (1.8, True), (2.2, False)])
@@ -103,19 +115,19 @@ def test_what_is_found_where_nothing_is_is_false():
 def test_what_is_named_where_no_mass_is_is_counted():
     """So that naming more than there is doesn't count as gain; gaps lie where they lie."""
     left = [left_out((0.0, 0.0, 670.0)), left_out((0.0, 40.0, 670.0)), left_out((0.0, 40.0, 670.0), (9.0, 9.0, 9.0), "gap")]
-    figures = mass_trial.judge(TRUE, Findings([ball(LARGE), ball(SMALL)], [0.1, 0.1], left, False, AXES))
+    figures = mass_trial.judge(TRUE, Findings([ball(LARGE), ball(SMALL)], [0.1, 0.1], [1.0, 1.0], left, False, AXES))
     assert (figures["masses_right"], figures["named_nowhere"]) == (2, 1)
 
 
 def test_two_masses_found_as_one_are_one_that_is_off_and_one_that_is_silent():
     near = [TRUE[0], Thing("tumour1", ball(((14.0, 0.0, 670.0), 4.0)), Material(0.4), inside=True)]
     merged = trimesh.util.concatenate([thing.mesh for thing in near])
-    figures = mass_trial.judge(near, Findings([merged], [0.1], [], False, AXES))
+    figures = mass_trial.judge(near, Findings([merged], [0.1], [1.0], [], False, AXES))
     assert (figures["masses_off"], figures["masses_silent"], figures["masses_false"]) == (1, 1, 0)
 
 
 def test_nothing_that_is_scanned_is_nothing_missed():
-    figures = mass_trial.judge([], Findings([ball()], [0.1], [], False, AXES))
+    figures = mass_trial.judge([], Findings([ball()], [0.1], [1.0], [], False, AXES))
     assert (figures["masses_true"], figures["masses_silent"], figures["masses_false"]) == (0, 0, 1)
 
 
