@@ -108,16 +108,19 @@ def from_scans(
         masses += refined(more.masses, power, sum(REFINEMENTS))
     masses, hidden = _with_backs(recording, grid, masses, power, with_shadows, sound)
     left_out += hidden
-    kept = list[Mass]()
+    kept, weak = list[Mass](), list[Mass]()
     for mass in masses:
         others = [other for other in masses if other is not mass]
         if any(_hides(*pair, power) for other in others for pair in ((mass, other), (other, mass))):
             left_out.append(_left_out("weak contrast", mass, power, "it may be the shadow of another, or that one its"))
         elif even and not all(_stands_out(mass, field) for field in ((power, with_shadows) if mass.bright else (power,))):
             left_out.append(_left_out("weak contrast", mass, power, "it hardly differs from the tissue around"))
+            weak.append(mass)
         else:
             kept.append(mass)
-    masses = kept
+    masses = [mass for mass in kept if not any(_behind(mass, one, power, LIMITS.edge_shadow_mm) for one in weak)]
+    why = "it may be the shadow of the border of one before it that is hardly seen"
+    left_out += [_left_out("in the shadow of a mass", mass, power, why) for mass in kept if mass not in masses]
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
         masses = blur_correction.corrected(masses, power, planes, partial(refined, times=REFINEMENTS[-1]))
@@ -252,9 +255,14 @@ def _no_back(recording: Recording, grid: Grid, masses: Sequence[Mass], number: i
             return "it fades towards its back, which isn't seen"
     elif any(_brightens(part, power) for part in parted(mass, power.volume.directions)):
         return "it grows brighter towards its back, which isn't told from its shadow"
-    own = 0.0 if mass.bright else _own(mass, power)
-    if passed(recording, grid, masses, number, sound) < LIMITS.passed + LIMITS.own * own:
+    own, through = 0.0 if mass.bright else _own(mass, power), passed(recording, grid, masses, number, sound)
+    if np.isinf(through):
+        return "no tissue is seen behind it, so its back isn't told from its shadow's end"
+    if through < LIMITS.passed + LIMITS.own * own:
         return "it is dark behind it, so its back isn't seen"
+    wide, deep, long = np.ptp(np.asarray(mass.mesh.vertices) @ power.volume.directions, axis=0).tolist()
+    if not mass.bright and through < LIMITS.shadowing and deep > LIMITS.tall * max(wide, long) and deep > LIMITS.tall_mm:
+        return f"it is {deep:.0f} mm deep, {max(wide, long):.0f} mm wide at most, and has a shadow, which may hang on to it"
     return ""
 
 
@@ -297,11 +305,11 @@ def _about_back(mass: Mass, power: EchoPower, deeper_mm: Sequence[float]) -> Arr
     return np.array([np.nanmean(level) if np.isfinite(level).any() else np.nan for level in levels])
 
 
-def _behind(mass: Mass, other: Mass, power: EchoPower) -> bool:
-    """Whether a mass's middle lies behind that of another, seen along the beam."""
+def _behind(mass: Mass, other: Mass, power: EchoPower, beside_mm: float = 0.0) -> bool:
+    """Whether a mass's middle lies behind another, seen along the beam, or by no more than that beside what lies behind it."""
     array, beam, across = ((mass.centre - other.centre) @ power.volume.directions).tolist()
     wide, _, long = np.abs((np.asarray(other.mesh.vertices) - other.centre) @ power.volume.directions).max(axis=0).tolist()
-    return beam > 0 and abs(array) < wide and abs(across) < long
+    return beam > 0 and abs(array) < wide + beside_mm and abs(across) < long + beside_mm
 
 
 def _hides(mass: Mass, other: Mass, power: EchoPower) -> bool:

@@ -52,6 +52,10 @@ class MassLimits:
     passed: float = 0.1  # of power that comes through a mass, at least: else its back isn't told from its shadow
     own: float = 1.5  # of a dark mass's own power, by which it is more; with less its back was found mm too deep
     within: float = 1.25  # of its own power 4 to 6 mm before its back, at most: else its shadow hangs on to it
+    tall: float = 1.3  # times as deep as wide is a dark mass that may have its shadow on it, if it is deep
+    tall_mm: float = 12.0
+    shadowing: float = 0.5  # of power that comes through such a mass, at most
+    edge_shadow_mm: float = 5.0  # beside a mass of which little is seen, from where its border may cast a shadow
     clutter: float = 0.01  # of power, at least, of which that is a multiple
     least_seen: float = 0.3  # of the core, by sound that came through other masses
 

@@ -387,6 +387,35 @@ def test_a_body_that_is_brighter_towards_its_back_has_its_shadow_on_it(monkeypat
     assert why(with_shadow, 0.5).startswith("it grows brighter towards its back")
 
 
+def test_a_body_taller_than_wide_with_a_shadow_may_have_it_on_it(monkeypatch):
+    """If half of tissue's power comes through at most. Without tissue behind, no back is known."""
+    mean, _ = ball()
+    power = EchoPower(Volume(np.full_like(mean, 0.1), ORIGIN, SPACING), np.ones(mean.shape, np.float32))
+
+    def why(stretch, through, radius=RADIUS):
+        mesh = trimesh.creation.icosphere(4, radius)
+        mesh.vertices *= [1, stretch, 1]
+        monkeypatch.setattr(masses, "passed", lambda *_: through)
+        return masses._no_back(None, None, [Mass(mesh.apply_translation(CENTRE))], 0, None, power)
+
+    deep, wide = 1.35 * 2 * RADIUS, 2 * RADIUS
+    assert why(1.35, 0.4) == f"it is {deep:.0f} mm deep, {wide:.0f} mm wide at most, and has a shadow, which may hang on to it"
+    assert why(1.25, 0.4) == why(1.35, 0.6) == why(1.35, 0.4, 4.0) == ""
+    assert why(1.0, np.inf) == "no tissue is seen behind it, so its back isn't told from its shadow's end"
+
+
+def test_behind_a_mass_lies_what_is_deeper_and_no_farther_aside_than_it_is_wide():
+    mean, _ = ball()
+    power = EchoPower(Volume(mean, ORIGIN, SPACING), np.ones(mean.shape, np.float32))
+    first = Mass(trimesh.creation.icosphere(2, 4.0).apply_translation(CENTRE))
+
+    def behind(shift, beside_mm=0.0):
+        return masses._behind(Mass(trimesh.creation.icosphere(2, 1.0).apply_translation(CENTRE + shift)), first, power, beside_mm)
+
+    assert behind([3.0, 15.0, 0.0]) and not behind([3.0, -15.0, 0.0]) and not behind([6.0, 15.0, 0.0])
+    assert behind([6.0, 15.0, 6.0], 3.0) and not behind([6.0, 15.0, 8.0], 3.0)
+
+
 def test_what_gel_adds_makes_no_body_and_hides_none(rng):
     """Gel over the array's end adds 0.7 dB/mm to what lies behind it, to the images' end, where a bright mass touches that."""
     place = (26.0, 20.0, 16.0)
