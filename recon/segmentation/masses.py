@@ -118,8 +118,11 @@ def from_scans(
             weak.append(mass)
         else:
             kept.append(mass)
-    masses = [mass for mass in kept if not any(_behind(mass, one, power, LIMITS.edge_shadow_mm) for one in weak)]
-    why = "it may be the shadow of the border of one before it that is hardly seen"
+    casting = [*weak, *(mass for mass in kept if mass.bright)]  # shadows of their borders that clearing leaves
+    masses = [
+        mass for mass in kept if mass.bright or not any(_behind(mass, one, power, LIMITS.edge_shadow_mm) for one in casting)
+    ]
+    why = "it may be the shadow of the border of one before it, which is bright or hardly seen"
     left_out += [_left_out("in the shadow of a mass", mass, power, why) for mass in kept if mass not in masses]
     if masses and blur is not None:
         planes = Planes(world_from_pixel, range(clip.v, shape[0]), shape[1], blur)
