@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_serializer, model_validator
+from pydantic import BaseModel, Field, field_validator, model_serializer, model_validator
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -247,6 +247,13 @@ def parted_mm(one: Target, other: Target) -> float:
     return least
 
 
+class Measured(Part):
+    """How well a number of the rig is known, and from what."""
+
+    sigma: NotNegative  # standard deviation, in the number's unit
+    source: Annotated[str, Field(min_length=1, max_length=1000)]
+
+
 BodyName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 
 
@@ -259,12 +266,38 @@ class Rig(Part):
     target: Target
     probe: Probe
     bodies: dict[BodyName, Target] = Field(default_factory=dict)  # such as a needle, or the patient
+    measured: dict[str, Measured] = Field(default_factory=dict)  # by dotted names, such as cam1.lens.f_number
 
     def __hash__(self) -> int:
         """Of all parts, as frozen models have it; a mapping has none of its own."""
-        return hash(
-            (*(getattr(self, name) for name in type(self).model_fields if name != "bodies"), frozenset(self.bodies.items()))
-        )
+        mappings = "bodies", "measured"
+        parts = (getattr(self, name) for name in type(self).model_fields if name not in mappings)
+        return hash((*parts, *(frozenset(getattr(self, name).items()) for name in mappings)))
+
+    def number(self, name: str) -> float:
+        """A number of the rig by its dotted name; KeyError if there is none."""
+        value: Any = self
+        for key in name.split("."):
+            if isinstance(value, tuple) and key.isdecimal() and int(key) < len(value):
+                value = value[int(key)]
+            elif isinstance(value, BaseModel) and key in type(value).model_fields:
+                value = getattr(value, key)
+            elif isinstance(value, dict) and key in value:
+                value = value[key]
+            else:
+                raise KeyError(name)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise KeyError(name)
+        return float(value)
+
+    @model_validator(mode="after")
+    def _measures_what_there_is(self) -> Self:
+        for name in self.measured:
+            try:
+                self.number(name)
+            except KeyError:
+                raise ValueError(f"measured: expected names of numbers, such as cam1.lens.f_number, found {name}") from None
+        return self
 
     @property
     def targets(self) -> dict[str, Target]:

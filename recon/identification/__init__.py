@@ -1,0 +1,1 @@
+"""The rig's parameters from its own captures: sensors, lenses, projector and scanner, each with its uncertainty."""

@@ -1,0 +1,73 @@
+"""Devices of a rig as they were calibrated: pinholes, lenses' distortion, and places."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recon.geometry.camera import Camera
+from recon.identification.estimates import Estimate, Findings
+from recon.model.calibration import WORLD, Calibration
+from recon.model.rig import Optics, Pose, Rig
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+SOURCE = "calibration by a board"
+
+
+def with_devices(rig: Rig, calibration: Calibration) -> Rig:
+    """The rig with its devices' optics as calibrated; cameras' nominal focal lengths follow by their pixels' size.
+
+    What was measured of these optics before doesn't count any more.
+    """
+    changed = {}
+    for name, camera in calibration.cameras.items():
+        if name not in ("cam1", "cam2", "projector"):
+            continue
+        device = getattr(rig, name)
+        update: dict[str, object] = {"optics": optics_of(camera)}
+        if name != "projector":
+            length = float(camera.matrix[0, 0]) * device.sensor.pixel_um * 1e-3
+            update["lens"] = device.lens.model_copy(update={"focal_length_mm": length})
+        changed[name] = device.model_copy(update=update)
+    replaced = tuple(f"{name}.optics." for name in changed)
+    kept = {name: one for name, one in rig.measured.items() if not name.startswith(replaced)}
+    return rig.model_copy(update=changed | {"measured": kept})
+
+
+def optics_of(camera: Camera) -> Optics:
+    """A calibrated camera as the rig's description has it."""
+    vector = np.rad2deg(Rotation.from_matrix(camera.camera_from_world[:3, :3]).as_rotvec())
+    return Optics(
+        size=camera.size,
+        focal_px=(float(camera.matrix[0, 0]), float(camera.matrix[1, 1])),
+        centre_px=(float(camera.matrix[0, 2]), float(camera.matrix[1, 2])),
+        distortion=tuple(camera.distortion.tolist()),
+        device_from_world=Pose(
+            rotation_deg=tuple(vector.tolist()), translation_mm=tuple(camera.camera_from_world[:3, 3].tolist())
+        ),
+    )
+
+
+def findings(calibration: Calibration) -> Findings:
+    """Numbers of all devices with the standard deviations of the calibration; none if it has no covariance.
+
+    A turn's standard deviation is that of its rotation vector, to first order in the turn.
+    """
+    known, found = calibration.uncertainty, dict[str, Estimate]()
+    if known is None:
+        return Findings(unknown={f"{name}.optics": "the calibration has no covariance" for name in calibration.cameras})
+    for name, camera in calibration.cameras.items():
+        fields = {"focal_px.0": "fx", "focal_px.1": "fy", "centre_px.0": "cx", "centre_px.1": "cy"}
+        fields |= {f"distortion.{k}": DISTORTION[k] for k in range(len(camera.distortion))}
+        if name != WORLD:
+            fields |= {f"device_from_world.translation_mm.{k}": f"t{axis}" for k, axis in enumerate("xyz")}
+            fields |= {f"device_from_world.rotation_deg.{k}": f"r{axis}" for k, axis in enumerate("xyz")}
+        optics = optics_of(camera).model_dump(mode="python")
+        for field, parameter in fields.items():
+            if f"{name}.{parameter}" in known.names:
+                value: Any = optics
+                for key in field.split("."):
+                    value = value[int(key) if key.isdecimal() else key]
+                unit = np.rad2deg(1.0) if "rotation" in field else 1.0
+                found[f"{name}.optics.{field}"] = Estimate(float(value), unit * known.sigma(f"{name}.{parameter}"), SOURCE)
+    return Findings(found)
