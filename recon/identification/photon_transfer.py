@@ -1,0 +1,170 @@
+"""Photon transfer: a camera's temporal noise over its grey level, from flat frames or from fringes.
+
+An electron makes K digital numbers (DN), and their number is Poisson, so a pixel's variance grows by K for each DN of its level.
+Variances are those of tiles of pixels, whose places are chosen before their values are seen: bins of level would pick noise.
+What a lamp changes from frame to frame is smooth, or follows the scene: it is fitted within each tile, and no noise.
+
+Source: EMVA 1288, Release 4.0 (variance against mean); Sheppard 1898 (variance of rounding).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.structured_light.phase import design, pseudo_inverse
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1 / 12  # DN^2, of whole numbers
+TILE = 16  # px, side of a tile: small against the lighting, and 256 pixels know their variance to 9 % from one pair of frames
+ROUNDS = 4  # of weights by the line that was fitted with the last ones
+
+
+@dataclass(frozen=True)
+class TransferLimits:
+    """Which tiles and lines count."""
+
+    dithered_dn: float = 0.6  # noise that hides the steps of whole numbers: the variance of rounding is 1/12 DN^2 to 2e-3 DN^2
+    margin: float = 5.0  # standard deviations between a tile's mean and the ends of the range
+    tiles: int = 16  # at least; their scatter is the line's uncertainty
+    harmonics: int = 3  # of fringes, which a projector's gamma adds with some strength, and which are left out
+    locked: int = 5  # harmonics of the fringes that a frame's error may show in a tile
+
+
+LIMITS = TransferLimits()
+
+
+class TileNoise(NamedTuple):
+    """Temporal noise of tiles of pixels."""
+
+    level: Array  # (t,) DN, mean over pixels and frames, by their shares of the variance
+    variance: Array  # (t,) DN^2, of one frame, rounding included
+    freedom: Array  # (t,) degrees of freedom
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """A line of variance over level, without rounding: `intercept + gain * level`."""
+
+    gain: float  # K, DN an electron
+    intercept: float  # DN^2, at level 0: K^2 dark_noise_e^2 - K black
+    covariance: Array  # (2, 2), of gain and intercept
+    darkest: float  # DN, of the tiles
+    brightest: float  # DN
+
+    def variance(self, level: Array | float) -> Array:
+        """Variance of one frame at a mean level, DN^2, rounding included."""
+        return np.asarray(self.intercept + self.gain * np.asarray(level, float) + ROUNDING)
+
+    def sigma(self, level: Array | float) -> Array:
+        """Standard deviation of that variance, DN^2."""
+        slopes = np.stack([np.asarray(level, float), np.ones_like(level, float)])
+        return np.sqrt(np.einsum("i...,ij,j...->...", slopes, self.covariance, slopes))
+
+
+def in_tiles(images: NDArray) -> NDArray:
+    """Pixels of images (..., h, w) by tile : (..., tiles, TILE^2); what is left over at the right and below is dropped."""
+    down, across = images.shape[-2] // TILE, images.shape[-1] // TILE
+    cut = images[..., : down * TILE, : across * TILE].reshape(*images.shape[:-2], down, TILE, across, TILE)
+    return cut.swapaxes(-3, -2).reshape(*images.shape[:-2], down * across, TILE * TILE)
+
+
+def noise_of_flat(frames: NDArray, bits: int) -> TileNoise:
+    """Temporal noise of frames of one steady scene.
+
+    A lamp's flicker scales the scene in each frame by its mean over the image; the rest is a constant of each tile. That the
+    black level isn't scaled leaves a tenth of what flicker does within a tile, at most, which is nothing beside noise.
+
+    Parameters
+    ----------
+    frames : (n, h, w), DN, n >= 2
+    bits : int
+        Of the images. Tiles near the ends of their range are left out.
+    """
+    n, full = len(frames), 2**bits - 1
+    mean = in_tiles(frames.mean(axis=0, dtype=np.float64))
+    level, spread = mean.mean(axis=1), mean.std(axis=1)
+    power = np.zeros(len(level))
+    for frame in frames:
+        off = in_tiles(frame) - mean
+        flicker = off.mean() / max(level.mean(), 1.0)
+        off -= off.mean(axis=1, keepdims=True) + flicker * (mean - level[:, None])
+        power += (off**2).sum(axis=1)
+    freedom = (n - 1) * (TILE**2 - 1)
+    variance = power / freedom
+    room = LIMITS.margin * np.sqrt(variance + spread**2)
+    usable = (level - room > 0) & (level + room < full)
+    return TileNoise(level[usable], variance[usable], np.full(np.count_nonzero(usable), float(freedom)))
+
+
+def noise_of_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
+    """Temporal noise of a sequence of shifted fringes on any steady scene.
+
+    A fringe and its first harmonics fill some of the n dimensions of a pixel's values; the others hold noise and errors of
+    frames: gains, offsets and shifts. In each tile such an error is a combination of the offset A, of 1, and of harmonics
+    B cos(m phase), B sin(m phase), which are fitted to each of those dimensions.
+
+    Parameters
+    ----------
+    images : (n, h, w), DN
+    shifts : (n,) rad
+    bits : int
+        Of the images. Tiles with a pixel that touches an end of their range are left out.
+
+    Raises
+    ------
+    ValueError
+        If there are too few images to leave a dimension for noise, or shifts leave the phase undetermined.
+    """
+    highest = min(LIMITS.harmonics, (len(shifts) - 2) // 2)
+    waves = design(shifts, highest)
+    if highest < 1 or len(shifts) != len(images):
+        raise ValueError(f"expected n >= 4 images (n, h, w) and n shifts, found {images.shape} and {len(shifts)} shifts")
+    tiles = in_tiles(images)
+    usable = (tiles.min(axis=(0, 2)) > 0) & (tiles.max(axis=(0, 2)) < 2**bits - 1)
+    values = tiles[:, usable].astype(float)
+    offset, c, s = np.tensordot(pseudo_inverse(shifts), values, 1)
+    phasor, turn = c + 1j * s, np.exp(1j * np.angle(c + 1j * s))
+    powers = [phasor * turn**m for m in range(LIMITS.locked)]
+    shapes = np.stack([np.ones_like(offset), offset, *(part for z in powers for part in (z.real, z.imag))], axis=-1)
+    left = np.linalg.svd(waves.T)[2][waves.shape[1] :]  # (dimensions, n), orthonormal, without the fringe
+    basis = _orthonormal(shapes)
+    noise = np.tensordot(left, values, 1)
+    noise -= np.einsum("tpm,tqm,ktq->ktp", basis, basis, noise, optimize=True)
+    free = 1 - (basis**2).sum(axis=2)  # of a pixel's noise, what the fit leaves: less of bright ones, which are noisier
+    pixels = free.sum(axis=1)
+    level = (free * offset).sum(axis=1) / pixels
+    return TileNoise(level, (noise**2).sum(axis=(0, 2)) / (len(left) * pixels), len(left) * pixels)
+
+
+def _orthonormal(shapes: Array) -> Array:
+    """Orthonormal bases : (t, p, m) of what shapes (t, p, m) span; zeros beyond its dimension."""
+    u, size, _ = np.linalg.svd(shapes / np.maximum(np.linalg.norm(shapes, axis=1, keepdims=True), 1e-30), full_matrices=False)
+    return u * (size > 1e-6 * size[:, :1])[:, None, :]
+
+
+def transfer_line(noise: TileNoise) -> PhotonTransfer | None:
+    """Fit the line of variance over level, with weights by itself.
+
+    Its standard deviations are those by the tiles' degrees of freedom, times the tiles' scatter about it where that is larger.
+    None if too few tiles have a noise that hides the steps of whole numbers, or their levels don't differ.
+    """
+    x, y = noise.level, noise.variance - ROUNDING
+    used, expected = y > LIMITS.dithered_dn**2, noise.variance
+    line = None
+    for _ in range(ROUNDS):
+        if np.count_nonzero(used) < LIMITS.tiles:
+            return None
+        root = np.sqrt(noise.freedom[used] / 2) / expected[used]
+        waves = np.stack([x[used], np.ones(len(root))], axis=1) * root[:, None]
+        if np.linalg.cond(waves / np.linalg.norm(waves, axis=0)) > 1e4:
+            return None
+        (gain, intercept), *_ = np.linalg.lstsq(waves, y[used] * root, rcond=None)
+        scatter = ((y[used] * root - waves @ [gain, intercept]) ** 2).sum() / (len(root) - 2)
+        covariance = np.linalg.inv(waves.T @ waves) * max(scatter, 1.0)
+        line = PhotonTransfer(float(gain), float(intercept), covariance, float(x[used].min()), float(x[used].max()))
+        expected = np.maximum(line.variance(x), ROUNDING)
+        used = line.variance(x) - ROUNDING > LIMITS.dithered_dn**2
+    return line
