@@ -1,0 +1,55 @@
+"""A projector's gamma, blur, focus and contrast, and the frames' errors, are found from images as well as is said."""
+
+import numpy as np
+import pytest
+
+from recon.identification import projector
+from recon.identification.estimates import Findings
+from recon.identification.projector import CameraBlur, Selection
+from recon.structured_light.decode import decode
+from sonotwin.choices import read_patterns
+from tests.recon.identification import fringe_images
+from twin.conditions import Frames
+
+CAMERA_SIGMA = 0.03  # px, of the camera's point spread
+
+
+def identified(rig, rng, sequence="gray_surface", **fixed) -> tuple[Findings, dict[str, float]]:
+    """What is found of a drawn projector, and the truth."""
+    drawn = {"gamma": rng.uniform(1, 2.6), "contrast": float(np.exp(rng.uniform(np.log(200), np.log(3000))))} | fixed
+    lens = {"f_number": rng.uniform(1.8, 4), "focus_mm": rng.uniform(450, 900), "blur_px": rng.uniform(0.3, 1.2)}
+    device = rig.projector.model_copy(update=drawn | {"lens": rig.projector.lens.model_copy(update=lens)})
+    frames = Frames(flicker=rng.uniform(0, 0.02), stray_dn=rng.uniform(0, 1), shift=rng.uniform(0, 0.06))
+    middle, spread, blur = rng.uniform(620, 700), rng.uniform(60, 140), rng.uniform(0.35, 0.6)
+    patterns, depths = read_patterns(sequence), (middle - spread / 2, middle + spread / 2)
+    shown = fringe_images.photograph(device, frames, patterns, rig.cam1.sensor, depths, blur, rng)
+    camera = CameraBlur(blur + CAMERA_SIGMA * rng.standard_normal(), CAMERA_SIGMA)
+    devices = fringe_images.CAMERA, fringe_images.PROJECTOR
+    found = projector.identify(
+        shown.images, patterns, decode(shown.images, patterns), shown.points, devices, rig.projector.lens.focal_length_mm, camera,
+        room=shown.room, selection=Selection(pixels=2000),
+    )  # fmt: skip
+    truth = {f"projector.{name}": value for name, value in drawn.items()} | {f"projector.lens.{k}": v for k, v in lens.items()}
+    return found, truth | {f"conditions.frames.{name}": value for name, value in frames.model_dump().items()}
+
+
+def test_gamma_and_errors_of_frames_are_found(rig, rng):
+    """Each within 3.5 of its standard deviations; gamma to 0.02, however blurred its harmonics are."""
+    found, truth = identified(rig, rng)
+    assert found.estimates["projector.gamma"].sigma < 0.02
+    for name, one in found.estimates.items():
+        assert abs(one.value - truth[name]) < 3.5 * one.sigma, name
+    assert found.estimates.keys() | found.unknown.keys() >= truth.keys()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sequence", "count"), [("gray_surface", 5), ("multi_frequency", 3)])
+def test_intervals_of_drawn_projectors_hold_what_they_say(rig, rng, sequence, count):
+    """Of all numbers 95 % lie within 1.96 sigma, less 3 sigma of their count; most lenses are parted into blur and focus."""
+    off, lenses = [], 0
+    for _ in range(count):
+        found, truth = identified(rig, rng, sequence)
+        off += [(one.value - truth[name]) / one.sigma for name, one in found.estimates.items()]
+        lenses += "projector.lens.focus_mm" in found.estimates
+    held = np.mean(np.abs(off) < 1.96)
+    assert held > 0.95 - 3 * np.sqrt(0.95 * 0.05 / len(off)) and np.std(off) > 0.5 and lenses >= count / 2
