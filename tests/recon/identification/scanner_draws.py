@@ -1,0 +1,102 @@
+"""Scanners drawn at random, and what the twin's scanner shows of even tissue, of air and of wires."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.identification.estimates import Estimate, Findings
+from recon.identification.scanner import Recordings, Sheet
+from recon.identification.wire_spread import Sightings
+from scenes.acoustics import TISSUES
+from scenes.tissue import Tissue
+from tests.twin.ultrasound.phantoms import down
+from twin.ultrasound.bscan import scan
+from twin.ultrasound.echo_solids import Body, Wire
+from twin.ultrasound.transducer import Transducer
+
+Images = NDArray[np.uint8]
+
+STEP_MM = 0.22  # between B-scans side by side
+LABEL, SHEET = 0.05, (0.05, 0.5)  # relative error of the frequency and of the attenuation, and dB of the tissue's echo
+EMPTY = Tissue(1.5, 1540.0, 0.0, None)
+
+
+def drawn(seed: int) -> tuple[Transducer, float, np.random.Generator]:
+    """A scanner of a narrow image, and the attenuation of its phantom; rows short enough for its pulse."""
+    rng = np.random.default_rng([seed, 77])
+    u = rng.uniform
+    frequency, depth = u(4, 12), u(30, 45)
+    row = min(u(0.04, 0.09), 0.77 / frequency)
+    band = u(0.4, 0.8)
+    array = Transducer(
+        image_size=(128, int(depth / row)),
+        scale_mm_per_px=(u(0.08, 0.14), row),
+        frequency_mhz=frequency,
+        bandwidth=(band, band * u(0.7, 1)),
+        transmit_focus_mm=u(12, 30),
+        transmit_f_number=u(1.8, 4),
+        receive_f_number=u(1.5, 4),
+        aperture_mm=u(12, 30),
+        elevation_mm=u(3, 7),
+        elevation_focus_mm=u(14, 30),
+        face_ring_mm=u(0.15, 0.5),
+        face_ring_db=u(-5, 8),
+        tgc_db_per_cm_mhz=u(0.3, 0.7),
+        gain_db=u(-35, -22),
+        noise_db=u(-70, -40),
+        dynamic_range_db=u(45, 80),
+        scatterers_per_mm3=64 * max(1, (frequency / 7.5) ** 2),
+    )
+    return array, u(0.4, 0.6), rng
+
+
+def recorded(array: Transducer, attenuation: float, seed: int, places: int = 8, steps: int = 14) -> Recordings:
+    """B-scans of even tissue at several places and side by side, and of air."""
+    tissue = Body(Tissue(1.6, 1540.0, attenuation, 0.0), (), ())
+
+    def images(body: Body, poses: list, first: int) -> Images:
+        return np.stack([scan(body, array, pose, seed, first + k).image for k, pose in enumerate(poses)])
+
+    beside = [down(array, (0, -500 + STEP_MM * k, 0)) for k in range(steps)]
+    return Recordings(
+        images(tissue, [down(array, (0, 30.0 * k, 0)) for k in range(places)], 0),
+        images(Body(EMPTY, (), ()), [down(array, (0, 0, 0))] * 3, 100),
+        images(tissue, beside, 200) if steps else None,
+        np.stack(beside) if steps else None,
+    )
+
+
+def sheet_of(array: Transducer, attenuation: float, rng: np.random.Generator) -> Sheet:
+    """What labels say, with their errors."""
+    f = array.frequency_mhz * (1 + LABEL * rng.standard_normal())
+    a = attenuation * (1 + SHEET[0] * rng.standard_normal())
+    return Sheet(
+        array.scale_mm_per_px,
+        Estimate(f, LABEL * f, "label"),
+        Estimate(a, SHEET[0] * a, "sheet"),
+        Estimate(SHEET[1] * rng.standard_normal(), SHEET[1], "sheet"),
+    )
+
+
+def wires_seen(array: Transducer, rng: np.random.Generator, count: int = 16) -> tuple[Images, Sightings]:
+    """B-scans of a steel wire each, every second one square to the plane, the others aslant by 35 to 60 degrees."""
+    images, pixels, directions = [], [], []
+    (sx, sy), steel = array.scale_mm_per_px, replace(TISSUES["steel"], roughness=0.0)
+    for k in range(count):
+        depth = float(rng.uniform(7, array.depth_mm - 3))
+        slant = 0 if k % 2 else np.deg2rad(rng.uniform(35, 60) * rng.choice([-1, 1]))
+        direction = np.array([np.sin(slant), 0.0, np.cos(slant)])
+        along = 20 * np.array([direction[0], -direction[2], 0.0])
+        wire = Wire("wire", steel, np.array([0, 0, depth]) + np.stack([-along, along]), 0.03)
+        images.append(scan(Body(EMPTY, (), (wire,)), array, down(array, (0, 0, 0)), 1, k).image)
+        pixels.append((array.width_mm / 2 / sx, depth / sy))
+        directions.append(direction)
+    return np.stack(images), Sightings(np.arange(count), np.array(pixels), np.array(directions))
+
+
+def deviations(found: Findings, array: Transducer) -> dict[str, float]:
+    """Errors over their standard deviations, by the field."""
+    truth = array.model_dump() | {f"bandwidth.{n}": value for n, value in enumerate(array.bandwidth)}
+    fields = {name.removeprefix("ultrasound."): each for name, each in found.estimates.items()}
+    return {name: (each.value - truth[name]) / each.sigma for name, each in fields.items()}
