@@ -6,6 +6,7 @@ circles' centres. Sources: Greivenkamp 1984; docs/physics-optics.md, docs/tracki
 """
 
 import numpy as np
+from scipy.special import j1
 
 from recon.geometry import rigid
 from recon.geometry.camera import Array, Camera
@@ -37,17 +38,16 @@ def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
 def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
     """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at a place : (3,) mm.
 
-    The first harmonic of the waveform behind the projector's gamma, less what blurs it: the mirrors, and by their variances both
-    lenses' point spreads and defocus and the camera's pixels: `sinc(1 / pitch) exp(-2 pi^2 s^2 / pitch^2)`. The surface faces
-    the devices.
+    The first harmonic of the waveform behind the projector's gamma, less what blurs it: the mirrors, `sinc(1 / pitch)`, and
+    `transfer`.
     """
     turn = 2 * np.pi * np.arange(WAVE) / WAVE
     shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
     black = 1 / rig.projector.contrast
     light = black + (1 - black) * shown
     first = 2 * np.mean(light * np.cos(turn))
-    mirrors = np.sinc(1 / fringes.pitch)
-    return float(first / light.mean() * mirrors * np.exp(-2 * np.pi**2 * _blur(rig, place) / fringes.pitch**2))
+    wave = np.array([1 / fringes.pitch])
+    return float(first / light.mean() * np.sinc(wave).item() * transfer(rig, place, wave).item())
 
 
 def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
@@ -57,27 +57,35 @@ def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
     turn once against the fringes, one forwards and one backwards, whatever the shift: no number of steps takes them out. As
     sinc has other signs for them, their errors `sin(2 pi x)` add up.
     """
-    wave, amplitudes = 1 / fringes.pitch, []
-    for replica in (1 - wave, 1 + wave):
-        blurred = np.exp(-2 * np.pi**2 * _blur(rig, place) * (replica**2 - wave**2))
-        amplitudes.append(np.sinc(replica) / np.sinc(wave) * blurred)
-    return float((amplitudes[0] - amplitudes[1]) / np.sqrt(2))
+    wave = 1 / fringes.pitch
+    waves = np.array([wave, 1 - wave, 1 + wave])
+    own, backwards, forwards = np.sinc(waves) * transfer(rig, place, waves)
+    return float(abs(backwards - forwards) / own / np.sqrt(2))
 
 
-def _blur(rig: Rig, place: Array) -> float:
-    """Variance of all blur but the mirrors' own width, projector px^2, of a surface at a place that faces the devices."""
-    (of_projector, at), (of_camera, before) = (_lens_blur(device, place) for device in (rig.projector, rig.cam1))
-    return of_projector + (of_camera + 1 / 12) * (at / before) ** 2
+def transfer(rig: Rig, place: Array, waves: Array) -> Array:
+    """Share : (n,) of the light's waves, cycles per projector px, that comes through both lenses and camera 1's pixels.
 
-
-def _lens_blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float]:
-    """Variance of a lens's blur along an axis, its own px^2, at a place, and its px for a mm there.
-
-    Point spread, and the disc of what is out of focus.
+    Of a surface at a place : (3,) mm that faces the devices. Point spreads are normal, what is out of focus is an even disc,
+    `2 J1(x) / x` with x = pi times its diameter in cycles, which is below zero beyond 1.22 cycles, and pixels are squares.
     """
+    of_projector, disc, at = _lens_blur(rig.projector, place)
+    of_camera, camera_disc, before = _lens_blur(rig.cam1, place)
+    pixel = at / before  # of the camera, in projector px
+    normal = np.exp(-2 * np.pi**2 * (of_projector**2 + (pixel * of_camera) ** 2) * waves**2)
+    return normal * _disc(disc * waves) * _disc(pixel * camera_disc * waves) * np.sinc(pixel * waves)
+
+
+def _disc(cycles: Array) -> Array:
+    x = np.maximum(np.pi * cycles, 1e-6)
+    return 2 * j1(x) / x
+
+
+def _lens_blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float, float]:
+    """A lens's point spread (standard deviation) and disc of what is out of focus (diameter), own px, and px for a mm there."""
     depth = float((device.optics.device_from_world.matrix() @ [*place, 1.0])[2])
     disc = device.optics.focal_px[0] * device.lens.aperture_mm * abs(1 / depth - 1 / device.lens.focus_mm)
-    return device.lens.blur_px**2 + disc**2 / 16, device.optics.focal_px[0] / depth
+    return device.lens.blur_px, disc, device.optics.focal_px[0] / depth
 
 
 def plane_sigma(rig: Rig, plane: Plane, column_sigma: float) -> float:

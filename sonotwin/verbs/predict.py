@@ -1,0 +1,122 @@
+"""Predict what error a rig will find on a plane, before anything is recorded, and what would lower it.
+
+Reads a rig, such as that of `sonotwin identify`, with patterns, a plate and settings of light and exposure; renders nothing. Says
+the RMS distance of points from their plane, with the interval that the rig's measured numbers leave, and how it changes with each
+of the rig's numbers by which it does: -1 is an error that halves when the number doubles. `changes` are other values of any
+fields, each with its price: they are tried one by one, the most error saved for the money first. Takes some seconds.
+
+The noise of camera 1 and the projector's raster are in it; errors of the calibration, flicker, and light that spreads in skin
+aren't.
+
+    sonotwin predict
+    sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700]
+    sonotwin predict "changes={rig.projector.radiant_flux_w: {to: 1.2, price: 800}, patterns.parts.1.steps: {to: 16, price: 0}}"
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from recon.errors import InputError, one_line
+from recon.model.part import Finite, NotNegative, Part
+from recon.model.patterns import Patterns
+from recon.model.rig import Rig
+from recon.registry import Choice
+from scenes.kinds import plane
+from sonotwin.console_watch import LineConsole
+from twin.experiments import predicted_plane
+from twin.experiments.predicted_plane import Measurement
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import Shooting
+
+TOLD = 0.02  # relative change of the error by that of a number: less isn't told
+NUMBERS = (
+    *(f"cam1.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
+    *(f"cam1.sensor.{name}" for name in ("saturation_e", "dark_noise_e", "black_level_dn")),
+    *(f"projector.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
+    *(f"projector.{name}" for name in ("radiant_flux_w", "gamma", "contrast")),
+)
+
+
+class Change(Part):
+    """Another value of a field, and what it costs."""
+
+    to: Finite
+    price: NotNegative = 0.0
+
+
+class Config(Part):
+    """Fields of `sonotwin predict`."""
+
+    rig: Annotated[Rig, Choice("meza2021")]
+    """the instruments"""
+    patterns: Annotated[Patterns, Choice("paper_surface")]
+    """that the projector shows"""
+    plate: plane.Config = plane.Config()
+    """the plane that is measured"""
+    shooting: Shooting = Shooting()
+    """exposure; set for the plane where it isn't given"""
+    tracing: Tracing = Tracing()
+    """of it, the room's light"""
+    changes: dict[str, Change] = Field(default_factory=dict)
+    """fields by dotted names, each with another value and its price: {rig.projector.gamma: {to: 1.0, price: 0}}"""
+
+
+def run(config: Config) -> None:
+    """Predict, and say what would lower the error; raises InputError for a change of what isn't there, or that can't be."""
+    console = LineConsole()
+    changed = {name: _changed(config, name, change) for name, change in config.changes.items()}
+    try:
+        lines = list(describe(config, changed))
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(f"predict: {error}") from error
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
+    """Lines: the error, its interval and causes, the numbers that it depends on, and the changes, the best for its price."""
+    rig, found = config.rig, predicted_plane.predict(config.rig, measurement_of(config))
+    sigma = predicted_plane.uncertainty(rig, measurement_of(config))
+    known = f"± {1.96 * sigma:.4f} mm (95 %, by {len(rig.measured)} measured numbers, if all others are as the rig has them)"
+    unknown = "of unknown uncertainty: none of the rig's numbers was measured, see `sonotwin identify`"
+    yield f"predicted   plane {found.rms_mm:.4f} mm RMS, {known if rig.measured else unknown}"
+    parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm"
+    yield f"by          {parts}; modulation {found.modulation_dn:.0f} DN, exposure {1e3 * found.exposure_s:.2f} ms"
+    for name, slope in predicted_plane.elasticities(rig, measurement_of(config), NUMBERS).items():
+        if abs(slope) >= TOLD:
+            yield f"depends     {name} {rig.number(name):g}: {slope:+.2f} % a per cent"
+    saved = {
+        name: (found.rms_mm - predicted_plane.predict(other.rig, measurement_of(other)).rms_mm, config.changes[name])
+        for name, other in changed.items()
+    }
+    for name, (less, change) in sorted(saved.items(), key=lambda pair: -_worth(*pair[1])):
+        yield f"change      {name} to {change.to:g}: {100 * less / found.rms_mm:+.1f} % less error for {change.price:g}"
+
+
+def measurement_of(config: Config) -> Measurement:
+    """What is to be measured."""
+    return Measurement(config.patterns, config.plate, config.shooting, config.tracing)
+
+
+def _worth(saved_mm: float, change: Change) -> float:
+    """Error saved for the money; of what costs nothing, all that it saves counts."""
+    return saved_mm / change.price if change.price else saved_mm * 1e9
+
+
+def _changed(config: Config, name: str, change: Change) -> Config:
+    """The fields with another value."""
+    content: Any = config.model_dump(mode="json", exclude={"changes"})
+    inner = content
+    *parents, last = name.split(".")
+    try:
+        for key in parents:
+            inner = inner[int(key)] if isinstance(inner, list) else inner[key]
+        key = int(last) if isinstance(inner, list) else last
+        inner[key] = round(change.to) if isinstance(inner[key], int) and not isinstance(inner[key], bool) else change.to
+        return Config.model_validate(content)
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        if isinstance(error, ValidationError):
+            raise InputError(f"changes: {name}: {one_line(error)}") from error
+        raise InputError(f"changes: expected the name of a field, such as rig.projector.gamma, found {name}") from None

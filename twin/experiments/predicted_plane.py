@@ -1,0 +1,182 @@
+"""The error of a plane that a rig will find, before anything is recorded, from its description; and what would lower it.
+
+At places all over the view: the light that comes back, the noise and the modulation of the finest fringes in it, the phase's
+error, and the plane's by the slope of the projector's column along the camera's ray. Errors of the calibration, and what is
+left of frames' errors after the decoder took them off, are not in it.
+
+Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from recon.errors import InputError
+from recon.geometry import rigid
+from recon.geometry.camera import Array
+from recon.geometry.primitives import Plane
+from recon.identification import rig_file
+from recon.identification.estimates import Estimate, Findings
+from recon.model.patterns import Fringes, Patterns
+from recon.model.rig import CameraDevice, ProjectorDevice, Rig
+from scenes.kinds import plane
+from twin.experiments import closed_forms
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import Shooting
+from twin.sensor import Exposure, electrons_per_radiance, noise_dn, number_per_electron
+
+GRID = (17, 13)  # places over camera 1's image, across and down
+WAVE = 512  # steps of a period
+BRIGHTEST = 99.0  # percentile of the places, at which the exposure is set; there are fewer than pixels
+STEP = 0.02  # relative, of the differences by which slopes are found
+SIGMAS = 0.5  # likewise, of a measured number
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What is to be measured, and how."""
+
+    patterns: Patterns
+    plate: plane.Config
+    shooting: Shooting
+    tracing: Tracing
+
+
+class Prediction(NamedTuple):
+    """Errors of a plane's points, RMS over what camera and projector both see."""
+
+    rms_mm: float
+    noise_mm: float  # by the cameras' noise alone
+    mirrors_mm: float  # by the projector's raster alone
+    modulation_dn: float  # median
+    exposure_s: float
+
+
+def predict(rig: Rig, measurement: Measurement) -> Prediction:
+    """Predict the RMS distance of points from the plane that they are of.
+
+    Raises
+    ------
+    ValueError
+        If camera 1 and the projector see nothing of it together.
+    """
+    fringes = closed_forms.fringes_of(measurement.patterns)
+    (flat,) = (shape for shape in plane.build(measurement.plate).shapes if isinstance(shape, Plane))
+    points, slopes = _seen(rig, flat, measurement.plate)
+    radiance = _radiance(rig, points, flat.normal, measurement.plate.reflectance)
+    room = measurement.plate.reflectance * measurement.tracing.room_radiance * _passed(rig.cam1, points)
+    waves = np.array([_wave(rig, fringes, point) for point in points])  # (n, 3) mean, amplitude, peak of the light
+    if any(not isinstance(part, Fringes) for part in measurement.patterns.parts):
+        waves[:, 2] = 1.0  # a code's stripes, or a uniform image
+    electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
+    shooting, sensor = measurement.shooting, rig.cam1.sensor
+    brightest = float(np.percentile(radiance * waves[:, 2] + room, BRIGHTEST)) * electron  # a second
+    longest_s = sensor.saturation_e / (brightest * shooting.gain)
+    time_s = shooting.exposure_s or shooting.level * longest_s
+    if time_s > longest_s:
+        expected = f"expected {1e3 * longest_s:.3g} ms at most, by which bright places saturate"
+        raise ValueError(f"shooting.exposure_s: {expected}, found {1e3 * time_s:.3g} ms")
+    exposure = Exposure(time_s, shooting.gain, shooting.bits)
+    per_electron = number_per_electron(sensor, exposure)
+    mean_e = (radiance * waves[:, 0] + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
+    modulation = radiance * waves[:, 1] * electron * time_s * per_electron
+    noise = noise_dn(np.float32(mean_e), sensor, exposure)
+    by_noise = np.sqrt(2 / fringes.steps) * noise / modulation
+    by_mirrors = np.array([closed_forms.raster_sigma(rig, fringes, point) for point in points])
+    mm_a_rad = fringes.pitch / (2 * np.pi) * slopes
+    noise_mm, mirrors_mm = (float(np.sqrt(np.mean((mm_a_rad * error) ** 2))) for error in (by_noise, by_mirrors))
+    return Prediction(float(np.hypot(noise_mm, mirrors_mm)), noise_mm, mirrors_mm, float(np.median(modulation)), float(time_s))
+
+
+def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:
+    """Points : (n, 3) mm of the plate that camera 1 and projector see, and the plane's error, mm, for a column's, px : (n,)."""
+    camera, projector = rig.cam1.optics.camera(), rig.projector.optics.camera()
+    across, down = ((np.arange(steps) + 0.5) / steps * length - 0.5 for length, steps in zip(camera.size, GRID, strict=True))
+    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    cosine = rays @ flat.normal
+    points = camera.centre + rays * (((flat.point - camera.centre) @ flat.normal) / cosine)[:, None]
+    columns = [projector.project(points + side * closed_forms.STEP_MM * rays) for side in (-1, 0, 1)]
+    slope = (columns[2] - columns[0])[:, 0] / (2 * closed_forms.STEP_MM)
+    seen = ((columns[1] > -0.5) & (columns[1] < np.array(projector.size) - 0.5)).all(axis=1)
+    local = rigid.apply(rigid.invert(plane.tilted(plate.centre_mm, plate.tilt_deg)), points)
+    seen &= (np.abs(local[:, :2]) < np.array(plate.size_mm) / 2).all(axis=1)
+    if not seen.any():
+        raise ValueError("plate: expected it in view of camera 1 and the projector, found it in none or one of them")
+    return points[seen], (np.abs(cosine) / np.abs(slope))[seen]
+
+
+def _radiance(rig: Rig, points: Array, normal: Array, reflectance: float) -> Array:
+    """Radiance : (n,) W/mm^2/sr of a matt surface, all of the projector on, as camera 1's lens lets it pass."""
+    optics, lens = rig.projector.optics, rig.projector.lens
+    camera = optics.camera()
+    local = rigid.apply(camera.camera_from_world, points)
+    distance = np.linalg.norm(local, axis=1)
+    slant = local[:, 2] / distance
+    facing = np.abs((camera.centre - points) @ normal) / distance
+    (width, height), (fx, fy) = optics.size, optics.focal_px
+    full = rig.projector.radiant_flux_w * fx * fy / (width * height)
+    irradiance = full * facing / slant**3 / distance**2 * (1 - lens.vignetting * _corner2(rig.projector, points))
+    return reflectance / np.pi * irradiance * _passed(rig.cam1, points)
+
+
+def _passed(device: CameraDevice, points: Array) -> Array:
+    """Share : (n,) of the light that a camera's lens lets pass on the way from points."""
+    local = rigid.apply(device.optics.camera().camera_from_world, points)
+    cosine2 = local[:, 2] ** 2 / (local**2).sum(axis=1)
+    return cosine2**2 * (1 - device.lens.vignetting * _corner2(device, points))
+
+
+def _corner2(device: CameraDevice | ProjectorDevice, points: Array) -> Array:
+    """Squared distance : (n,) of points' pixels from the image's middle, 1 in a corner."""
+    camera = device.optics.camera()
+    middle = (np.array(camera.size) - 1) / 2
+    return ((camera.project(points) - middle) ** 2).sum(axis=1) / (middle @ middle)
+
+
+def _wave(rig: Rig, fringes: Fringes, place: Array) -> tuple[float, float, float]:
+    """Mean, first harmonic's amplitude and peak of the fringes' light at a place with all blur, 1 for a pixel fully on."""
+    turn = 2 * np.pi * np.arange(WAVE) / WAVE
+    shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
+    black = 1 / rig.projector.contrast
+    harmonics = np.fft.rfft(black + (1 - black) * shown) / WAVE
+    waves = np.arange(len(harmonics)) / fringes.pitch
+    harmonics = harmonics * np.sinc(waves) * closed_forms.transfer(rig, place, waves)
+    peak = float(np.fft.irfft(harmonics * WAVE).max())
+    return float(harmonics[0].real), float(2 * np.abs(harmonics[1])), peak
+
+
+def uncertainty(rig: Rig, measurement: Measurement) -> float:
+    """Standard deviation of the predicted RMS, mm, by those of the rig's measured numbers, which err independently."""
+    total = 0.0
+    for name, known in rig.measured.items():
+        if known.sigma == 0:
+            continue
+        ends = [_changed(rig, name, side * SIGMAS * known.sigma) for side in (-1, 1)]
+        way = ends[1].number(name) - ends[0].number(name)  # less at a bound
+        slope = np.diff([predict(end, measurement).rms_mm for end in ends]).item() / way if way else 0.0
+        total += (slope * known.sigma) ** 2
+    return float(np.sqrt(total))
+
+
+def _changed(rig: Rig, name: str, by: float) -> Rig:
+    """The rig with one number changed, as far as it may be."""
+    value = rig.number(name)
+    for changed in (value + by, value):  # one that can't be is left
+        try:
+            return rig_file.apply(rig, Findings({name: Estimate(changed, 0.0, "a change")}))
+        except InputError:
+            continue
+    return rig
+
+
+def elasticities(rig: Rig, measurement: Measurement, names: Sequence[str]) -> dict[str, float]:
+    """Relative change of the RMS by a relative change of each number : d ln rms / d ln number, the largest first."""
+    found = {}
+    for name in names:
+        ends = [_changed(rig, name, side * STEP * rig.number(name)) for side in (-1, 1)]
+        way = np.diff(np.log([max(end.number(name), 1e-12) for end in ends])).item()
+        errors = np.log([predict(end, measurement).rms_mm for end in ends])
+        found[name] = float(np.diff(errors).item() / way) if way else 0.0
+    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
