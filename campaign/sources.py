@@ -124,6 +124,10 @@ COMMANDS = (
     Command("calibrate-probe", ("capture=wall/capture", "phantom=wall", "max_sigma_mm=5"), ("wall",), _sweep("wall")),
     Command("calibrate-probe", ("capture=sphere/capture", "phantom=sphere", "sphere_radius_mm=19.8", "max_sigma_mm=5"),
             ("sphere",), _sweep("sphere")),
+    Command("identify", ("capture=both/capture",), ("both",),
+            ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
+    Command("identify", ("capture=board/capture", "dark=covered"), ("board", "covered"),
+            ("board/capture/manifest.json", "board/capture/board/01/cam1/0003.png", "covered/cam1/0003.png")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),
@@ -240,6 +244,7 @@ def _write_others(folder: Path) -> None:
     from recon.tracking import networks
 
     shutil.copytree(folder / "ball/capture/surface/cam1", folder / "shots", dirs_exist_ok=True)
+    shutil.copytree(folder / "ball/capture/surface/cam1", folder / "covered/cam1", dirs_exist_ok=True)
     patterns = surface_part.read_surface(folder / "ball/capture").patterns
     (folder / "patterns.yaml").write_text(yaml.safe_dump(json.loads(patterns.model_dump_json())), encoding="utf-8")
     shutil.copytree(networks.WEIGHTS, folder / "networks", dirs_exist_ok=True)

@@ -48,6 +48,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "patient": "twin.experiments.patient_trial",
     "masses": "twin.experiments.mass_trial",
     "seen": "twin.experiments.seen_trial",
+    "identify": "twin.experiments.identify_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made

@@ -1,0 +1,341 @@
+"""The rig's parameters from its own captures: the settings of the step, the step, and the files of its result."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.capture import board_part, calibration_files, surface_part
+from recon.capture.board_part import BoardCapture
+from recon.capture.images import image_files, read_images
+from recon.capture.manifest import Device, Manifest, PartName, read_manifest
+from recon.capture.surface_part import SurfaceCapture
+from recon.errors import InputError
+from recon.files import atomic
+from recon.identification import calibrated_optics, lenses, projector, rig_file, sensors, vignetting
+from recon.identification.estimates import Estimate, Findings
+from recon.identification.projector import CameraBlur
+from recon.identification.sensors import DarkStack, FringeStack, ImageSettings
+from recon.model.boards import Discs
+from recon.model.calibration import Calibration
+from recon.model.part import Part, Positive
+from recon.model.patterns import Fringes
+from recon.model.rig import Rig
+from recon.optical_calibration.joint_calibration import Result
+from recon.registry import Choice
+from recon.session import optics_step
+from recon.session.watch import SILENT, Watch
+from recon.structured_light import phase
+from recon.structured_light.decode import decode
+from recon.structured_light.triangulate import triangulate
+
+BY = "identify"  # who writes
+RIG, CONDITIONS, FIGURES = "rig.yaml", "conditions.yaml", "identified.json"
+CAMERAS = ("cam1", "cam2")
+BLUR_SIGMA_PX = 0.15  # of a camera's point spread where no board showed it
+BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
+
+LENS = ("f_number", "focus_mm", "blur_px", "vignetting")
+SENSOR = (
+    "saturation_e",
+    "dark_noise_e",
+    "dsnu_e",
+    "prnu",
+    "black_level_dn",
+    "quantum_efficiency",
+    "adc_bits",
+    "dark_current_e_per_s",
+)
+NOT_SEEN = {  # reasons of what no part of a capture shows
+    **{f"{camera}.sensor.{name}": f"no images of {camera}" for camera in CAMERAS for name in SENSOR},
+    **{f"{camera}.lens.{name}": f"no board of discs before {camera}" for camera in CAMERAS for name in LENS},
+    **{f"projector.lens.{name}": "no surface under patterns before cam1" for name in LENS},
+    "projector.lens.vignetting": "no board lit by the projector",
+    **{f"projector.{name}": "no surface under patterns before cam1" for name in ("gamma", "contrast")},
+    **{f"conditions.frames.{name}": "no surface under grey fringes before cam1" for name in ("flicker", "stray_dn", "shift")},
+}
+
+Images = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+class Settings(Part):
+    """Sources, and what is read off data sheets."""
+
+    capture: Path
+    """a capture folder with a board, a surface under fringes, or both"""
+    rig: Annotated[Rig, Choice("meza2021")]
+    """to begin with: what isn't measured stays as it has it, such as the pixels' size"""
+    calibration: Path | None = None
+    """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
+    dark: Path | None = None
+    """folder of images with covered lenses, in cam1/ and cam2/, exposed as the capture's: black level, dark noise, DSNU"""
+    flat: Path | None = None
+    """the same of an even light, at one level, or at several in a folder each, such as cam1/half/: gain, PRNU"""
+    room: Path | None = None
+    """the same of the scene with the projector covered: tells the projector's black from the room's light"""
+    gain: Positive | None = None
+    """linear, of the cameras: 1 fills the range with the sensor's saturation charge; null: as the capture has it, else 1"""
+    adc_bits: Annotated[int | None, Field(ge=8, le=16)] = None
+    """of both cameras' converters, by the data sheet, if at hand; else as of `rig`, with a doubt"""
+
+
+def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
+    """Identify, and write the rig's file, that of its conditions, and all figures.
+
+    Raises
+    ------
+    InputError
+        If the capture is incomplete or damaged, holds neither a board nor fringes, or `out` can't be written to.
+    """
+    inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room)
+    atomic.check_folder(out, BY, inputs=inputs)
+    rig, found = identify(settings, watch)
+    for line in describe(found):
+        watch.say(line)
+    heading = "\n".join(
+        (
+            f"A rig as identified from {settings.capture.resolve().name}: numbers with an uncertainty (1 sigma) were measured,",
+            "others are as in the rig that it began with, or in its calibration. `sonotwin VERB rig=FILE` takes it.",
+        )
+    )
+    with atomic.new_folder(out, BY) as new:
+        rig_file.write(new / RIG, rig, found.unknown, heading)
+        (new / CONDITIONS).write_text(conditions_text(found), encoding="utf-8")
+        content = json.dumps(asdict(found), indent=2, ensure_ascii=False, allow_nan=False)
+        (new / FIGURES).write_text(content + "\n", encoding="utf-8")
+    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}")
+
+
+def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
+    """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
+    manifest = read_manifest(settings.capture)
+    if manifest.board is None and manifest.surface is None:
+        raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
+    part: PartName = "board" if manifest.surface is None else "surface"
+    frames = {
+        camera: _frames(settings, camera, device) for camera, device in manifest.devices_of(part).items() if camera in CAMERAS
+    }
+    for folder in (settings.dark, settings.flat, settings.room):
+        if folder is not None and not any((folder / camera).is_dir() for camera in frames):
+            there = "a file" if folder.is_file() else "none" if folder.is_dir() else "nothing"
+            raise InputError(f"{folder}: expected a folder with images in {' or '.join(frames)}, found {there}")
+    found, rig, board = Findings(unknown=NOT_SEEN), settings.rig, None
+    if manifest.board is not None:
+        captured = board_part.read_board(settings.capture)
+        board = captured, optics_step.calibrate(captured, watch=watch).result
+    shots = _shots(settings, manifest, None if board is None else board[1].adjustment.calibration)
+    calibration = next(iter(shots.values())).calibration if board is None else board[1].adjustment.calibration
+    rig = calibrated_optics.with_devices(rig, calibration)
+    found |= calibrated_optics.findings(calibration)
+    for camera, own in frames.items():
+        with watch.busy(f"measuring the sensor of {camera}"):
+            found |= _sensor(camera, settings, own, shots.get(camera))
+    if board is not None:
+        with watch.busy("measuring the lenses"):
+            found |= _lenses(*board, rig, found)
+    if CAMERAS[0] in shots:
+        with watch.busy("measuring the projector"):
+            found |= _projector(CAMERAS[0], shots[CAMERAS[0]], rig, found, frames[CAMERAS[0]].room)
+    if settings.adc_bits is not None:
+        sensors_of = {camera: getattr(rig, camera).sensor.model_copy(update={"adc_bits": settings.adc_bits}) for camera in frames}
+        rig = rig.model_copy(
+            update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
+        )
+    return rig_file.apply(rig, found), found
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """Further images of one camera, and how it was set for the capture."""
+
+    device: Device
+    dark: Images | None
+    flats: Sequence[Images]
+    room: Images | None
+
+
+def _frames(settings: Settings, camera: str, device: Device) -> _Frames:
+    if settings.gain is not None and device.gain is not None and settings.gain != device.gain:
+        raise InputError(f"gain: expected {device.gain:g}, as the capture has it for {camera}, found {settings.gain:g}")
+    if settings.adc_bits is not None and settings.adc_bits < device.bits:
+        raise InputError(f"adc_bits: expected {device.bits} or more, as {camera}'s images have, found {settings.adc_bits}")
+    dark, room = (_stack(folder, camera, device) for folder in (settings.dark, settings.room))
+    return _Frames(device, dark, list(_flats(settings.flat, camera, device)), room)
+
+
+def _shots(settings: Settings, manifest: Manifest, calibration: Calibration | None) -> dict[str, SurfaceCapture]:
+    """Fringes before each camera that took them, by a new calibration, if there is one."""
+    if manifest.surface is None:
+        return {}
+    with TemporaryDirectory() as folder:
+        file = settings.calibration
+        if calibration is not None:
+            file = Path(folder) / "optics.yaml"
+            calibration_files.write(file, calibration)
+        cameras = [name for name in CAMERAS if name in manifest.surface.images]
+        return {camera: surface_part.read_surface(settings.capture, camera, file) for camera in cameras}
+
+
+def _sensor(camera: str, settings: Settings, frames: _Frames, shot: SurfaceCapture | None) -> Findings:
+    device, dark = frames.device, frames.dark
+    fringes = []
+    if shot is not None:  # harmonics of binary fringes look like noise
+        sets = [(part, place) for part, place in shot.patterns.slices() if isinstance(part, Fringes) and part.waveform == "sine"]
+        fringes = [
+            FringeStack(shot.images[place], part.shifts) for part, place in sets if part.steps >= phase.MIN_STEPS_FOR_NOISE
+        ]
+    gain = device.gain if settings.gain is None else settings.gain
+    return sensors.identify_sensor(
+        camera,
+        ImageSettings(device.bits, gain, settings.adc_bits),
+        dark=[] if dark is None else [DarkStack(dark, device.exposure_s)],
+        flats=frames.flats,
+        fringes=fringes,
+    )
+
+
+def _lenses(captured: BoardCapture, optics: Result, rig: Rig, known: Findings) -> Findings:
+    """Blur and light of both cameras by the board's discs and its white."""
+    found, calibration = Findings(), optics.adjustment.calibration
+    places = dict(zip(optics.observations.poses, optics.adjustment.poses, strict=True))
+    if not isinstance(captured.board, Discs):
+        why = "needs a board of discs: edges of squares aren't measured"
+        return Findings(unknown={f"{camera}.lens.{name}": why for camera in captured.cameras for name in LENS})
+    rims = {camera: list[lenses.Rims]() for camera in captured.cameras if camera in calibration.cameras}
+    whites = {camera: list[vignetting.Whites]() for camera in rims}
+    for number, name in enumerate(captured.poses):
+        if name not in places:
+            continue
+        pose = captured.pose(number)
+        for camera, image in pose.lit.items():
+            if camera not in rims:
+                continue
+            seen = (calibration.cameras[camera], places[name])
+            full = 2.0 ** captured.devices[camera].bits - 1
+            rims[camera].append(
+                lenses.measure_rims(image, captured.board, *seen, points=optics.adjustment.points, pose=number, full=full)
+            )
+            if "projector" in calibration.cameras and not captured.board.white:
+                lit = (calibration.cameras[camera], calibration.cameras["projector"], places[name])
+                whites[camera].append(
+                    vignetting.measure_whites(
+                        image, captured.board, *lit, points=optics.adjustment.points, pose=number, full=full
+                    )
+                )
+    for camera, parts in rims.items():
+        length = getattr(rig, camera).lens.focal_length_mm
+        nominal = Estimate(length, 0.0, "the calibrated focal length, and the pixels' size")
+        found |= lenses.find_lens(lenses.joined(parts), camera, focal_length=nominal)
+        if whites[camera]:
+            light = vignetting.find_vignetting(
+                vignetting.joined(whites[camera]), camera, black=_black(camera, captured, rig, known)
+            )
+            found |= replace(light, estimates=light.estimates | _agreed(found.estimates, light.estimates))
+    return found
+
+
+def _black(camera: str, captured: BoardCapture, rig: Rig, known: Findings) -> Estimate:
+    """A pixel without light, in DN of the board's images."""
+    assumed = Estimate(getattr(rig, camera).sensor.black_level_dn, BLACK_SIGMA_DN, "assumed")
+    one, deeper = known.estimates.get(f"{camera}.sensor.black_level_dn", assumed), 2.0 ** (captured.devices[camera].bits - 8)
+    return Estimate(deeper * one.value, deeper * one.sigma, one.source)
+
+
+def _agreed(first: Mapping[str, Estimate], second: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """What both measured: weighed by variance, and as uncertain as they differ, if that is more."""
+    found = dict[str, Estimate]()
+    for name in first.keys() & second.keys():
+        one, other = first[name], second[name]
+        weights = np.array([one.sigma, other.sigma]) ** -2.0
+        value = float(weights @ [one.value, other.value] / weights.sum())
+        sigma = float(weights.sum() ** -0.5 * max(1.0, abs(one.value - other.value) / np.hypot(one.sigma, other.sigma)))
+        found[name] = Estimate(value, sigma, f"{one.source}; {other.source}")
+    return found
+
+
+def _projector(camera: str, shot: SurfaceCapture, rig: Rig, found: Findings, room: Images | None) -> Findings:
+    """The projector's light, as the camera saw it; nothing of its lens if the camera's isn't measured, whose blur looks alike."""
+    devices = shot.calibration.cameras[camera], shot.calibration.cameras["projector"]
+    length = rig.projector.lens.focal_length_mm
+    try:
+        decoded = decode(shot.images, shot.patterns, bits=shot.bits, name=shot.name, camera=camera)
+        points = triangulate(decoded, *devices)
+        seen = projector.identify(
+            shot.images, shot.patterns, decoded, points, devices, length, _blur(camera, rig, found), bits=shot.bits, room=room
+        )
+    except InputError as error:
+        return Findings(unknown={name: str(error) for name in NOT_SEEN if name.startswith(("projector.", "conditions."))})
+    if f"{camera}.lens.focus_mm" in found.estimates:
+        return seen
+    names = [f"projector.lens.{name}" for name in ("blur_px", "f_number", "focus_mm")]
+    why = f"needs the blur of {camera}, which a board of discs shows"
+    estimates = {name: one for name, one in seen.estimates.items() if name not in names}
+    return Findings(estimates, seen.unknown | dict.fromkeys(names, why))
+
+
+def _blur(camera: str, rig: Rig, found: Findings) -> CameraBlur:
+    """A camera's blur as measured, or as the rig has it."""
+    lens, known = getattr(rig, camera).lens, found.estimates
+    point = known.get(f"{camera}.lens.blur_px", Estimate(lens.blur_px, BLUR_SIGMA_PX, "assumed"))
+    names = [f"{camera}.lens.{name}" for name in ("f_number", "focus_mm")]
+    if not all(name in known for name in names):
+        return CameraBlur(point.value, point.sigma, lens.aperture_mm, lens.focus_mm)
+    number, focus = (known[name].value for name in names)
+    return CameraBlur(point.value, point.sigma, lens.focal_length_mm / number, focus)
+
+
+def _stack(folder: Path | None, camera: str, device: Device) -> Images | None:
+    """Images : (n, h, w) of a camera in a folder of its name; None without a folder."""
+    return None if folder is None or not (folder / camera).is_dir() else _images(folder / camera, device)
+
+
+def _flats(folder: Path | None, camera: str, device: Device) -> Iterator[Images]:
+    """Images of each level, in folders of their own or in one."""
+    if folder is None or not (folder / camera).is_dir():
+        return
+    levels = sorted(path for path in (folder / camera).iterdir() if path.is_dir())
+    for level in levels or [folder / camera]:
+        yield _images(level, device)
+
+
+def _images(folder: Path, device: Device) -> Images:
+    paths = image_files(folder)
+    if len(paths) < 2:
+        raise InputError(f"{folder}: expected two images or more of one thing, found {len(paths)}")
+    return read_images(paths, device.size, device.bits)
+
+
+def conditions_text(found: Findings) -> str:
+    """A file for `conditions=FILE`: as measured, all else ideal."""
+    content: dict[str, Any] = {}
+    lines = ["# conditions as identified, with their standard deviations; all else is ideal"]
+    for name, one in found.estimates.items():
+        group, _, rest = name.partition(".")
+        if group == "conditions":
+            part, field = rest.split(".")
+            content.setdefault(part, {})[field] = float(f"{one.value:.4g}")
+            lines.append(f"# {rest}: ± {one.sigma:.2g}, {one.source}")
+    return "\n".join(lines) + "\n" + yaml.safe_dump({"defaults": ["ideal"], **content}, sort_keys=False)
+
+
+def describe(found: Findings) -> Iterator[str]:
+    """Lines: numbers by the part of the rig that they are of, and what isn't known for one reason."""
+    parts: dict[str, list[str]] = {}
+    for name, one in found.estimates.items():
+        device, optics, field = name.partition(".optics.")
+        part, _, field = (f"{device}.optics", "", field) if optics else name.rpartition(".")
+        parts.setdefault(part, []).append(f"{field} {one.value:.5g} ± {one.sigma:.2g}")
+    for part, numbers in parts.items():
+        yield f"measured    {part}: {', '.join(numbers)}"
+    reasons: dict[str, list[str]] = {}
+    for name, why in found.unknown.items():
+        reasons.setdefault(why, []).append(name)
+    for why, names in reasons.items():
+        yield f"unknown     {', '.join(names)}: {why}"

@@ -1,0 +1,154 @@
+"""Rigs drawn at random, their captures rendered, and the rigs identified from these, in units of what is said of their errors.
+
+The rig's sheet, which identification begins with, has what is read off data sheets: sizes, pixels, nominal focal lengths, light.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.files.metrics import Metrics
+from recon.identification.estimates import Findings
+from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
+from recon.model.rig import Rig
+from recon.session import rig_step
+from scenes.board_poses import Config as BoardPoses
+from scenes.catalogue import build_scene
+from twin import board_session
+from twin.conditions import Conditions
+from twin.experiments import drawn_rig
+from twin.experiments.experiment_runs import Experiment, Settings
+from twin.optics import surface_session
+from twin.optics.light_transport import Tracing
+from twin.optics.surface_session import Shooting
+from twin.sensor import Exposure, electrons_per_radiance, expose
+from twin.session import CAPTURE, Session
+from twin.working_range import working_range
+
+Array = NDArray[np.float64]
+
+SCENES = ("breast", "sphere", "two_objects")
+TRACING = Tracing(samples=32, room_lux=20)  # more than usual: drawn cameras blur over several samples' distance
+CAMERAS = board_session.CAMERAS
+POSES = 10  # of the board
+FRAMES = 16  # dark ones, and flat ones of each level
+LEVELS = (0.3, 0.8)  # of full scale, of flat frames
+NEUTRAL = {  # what is to be identified, as a sheet has it: ordinary values
+    "lens": {"f_number": 8.0, "focus_mm": 660.0, "blur_px": 0.5, "vignetting": 0.1},
+    "sensor": {"saturation_e": 8000.0, "dark_noise_e": 10.0, "dsnu_e": 5.0, "prnu": 0.008, "black_level_dn": 3.0},
+    "projector": {"gamma": 2.2, "contrast": 1000.0},
+}
+
+
+def measure(settings: Settings, seed: int) -> Metrics:
+    """Errors over sigmas of all numbers that were measured, and how many of the 95 % intervals hold the truth."""
+    rig, conditions = drawn_rig.draw(settings.rig, seed)
+    with TemporaryDirectory() as folder:
+        out = Path(folder)
+        exposures = record_surface(rig, conditions, out, seed)
+        record_board(rig, conditions, out, settings.poses.seed + seed, seed)
+        record_frames(rig, exposures, out, seed)
+        chosen = rig_step.Settings(
+            capture=out / CAPTURE, rig=sheet_of(rig), dark=out / "dark", flat=out / "flat", adc_bits=rig.cam1.sensor.adc_bits
+        )
+        _, found = rig_step.identify(chosen)
+    return judge(found, truth_of(rig, conditions, found))
+
+
+def patterns_of(rig: Rig) -> Patterns:
+    """Fringes and a code along the columns, whose stripes have many widths."""
+    parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=8, complementary=True))
+    return Patterns(projector_size=rig.projector.optics.size, unwrap="gray", parts=parts)
+
+
+def board_patterns_of(rig: Rig) -> Patterns:
+    """A code along both axes, to the pixel: no grey levels, whose shifts would err alike over a whole board."""
+    size = rig.projector.optics.size
+    axes: tuple[Axis, Axis] = ("columns", "rows")
+    bits = [int(np.ceil(np.log2(length))) for length in size]
+    parts = [GrayCode(axis=axis, pitch=1, bits=count, inverted=True) for axis, count in zip(axes, bits, strict=True)]
+    return Patterns(projector_size=size, unwrap="gray", parts=tuple(parts))
+
+
+def record_surface(rig: Rig, conditions: Conditions, out: Path, seed: int) -> dict[str, Exposure]:
+    """A scene under fringes, before both cameras; returns their exposures."""
+    scene, patterns = build_scene({"kind": SCENES[seed % len(SCENES)]}), patterns_of(rig)
+    shot = partial(surface_session.shoot, rig, scene, patterns)
+    views = {camera: shot(camera, TRACING, Shooting(), seed, conditions) for camera in CAMERAS}
+    session = Session(out, "surface", {}, True)
+    surface_session.write_session(session, rig, rig, scene, patterns, views)
+    return {camera: view.exposure for camera, view in views.items()}
+
+
+def record_board(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> None:
+    """The board in some poses."""
+    work = working_range(rig)
+    poses = work.poses(BoardPoses(count=POSES, seed=poses_seed))
+    design = work.board(board_session.board.Config())
+    chosen = board_session.Settings(
+        rig, design, poses, board_patterns_of(rig), ("cam1", "cam2"), TRACING, Shooting(), seed, conditions
+    )
+    session, stage = Session(out, "board", {}, True), board_session.set_up(chosen)
+    exposures, placed = board_session.set_exposures(stage, chosen), board_session.place_all(chosen)
+    for number in board_session.missing_poses(session, chosen):
+        board_session.write_pose(session, number, *board_session.shoot_pose(stage, chosen, exposures, number, placed[number]))
+    board_session.finish(session, chosen, exposures, placed)
+
+
+def record_frames(rig: Rig, exposures: Mapping[str, Exposure], out: Path, seed: int) -> None:
+    """Dark frames, and flat ones of an even light that falls by a fifth towards a corner, exposed as the surface."""
+    for number, name in enumerate(("cam1", "cam2")):
+        device = getattr(rig, name)
+        width, height = device.optics.size
+        slope = np.linspace(1.0, 0.9, width) * np.linspace(1.0, 0.9, height)[:, None]
+        exposure = exposures[name]
+        electron = electrons_per_radiance(device, rig.projector.wavelength_nm) * exposure.time_s
+        for place, level in {"dark": 0.0, **{f"flat/{{}}/{k}": level for k, level in enumerate(LEVELS)}}.items():
+            radiance = np.float32(slope * level * device.sensor.saturation_e / electron)
+            stack = np.broadcast_to(radiance, (FRAMES, height, width))
+            images = expose(stack, device, rig.projector.wavelength_nm, exposure, seed + number + round(100 * level))
+            folder = out / (place.format(name) if "{}" in place else f"{place}/{name}")
+            folder.mkdir(parents=True)
+            for k, image in enumerate(images):
+                cv2.imwrite(str(folder / f"{k:02d}.png"), image)
+
+
+def sheet_of(rig: Rig) -> Rig:
+    """What a data sheet says of a rig: ordinary values for what is to be identified."""
+    changed = {}
+    for name in ("cam1", "cam2"):
+        device = getattr(rig, name)
+        lens, sensor = (getattr(device, part).model_copy(update=NEUTRAL[part]) for part in ("lens", "sensor"))
+        changed[name] = device.model_copy(update={"lens": lens, "sensor": sensor})
+    lens = rig.projector.lens.model_copy(update={"f_number": 2.4, "focus_mm": 660.0, "blur_px": 0.5, "vignetting": 0.15})
+    changed["projector"] = rig.projector.model_copy(update={"lens": lens, **NEUTRAL["projector"]})
+    return rig.model_copy(update=changed)
+
+
+def truth_of(rig: Rig, conditions: Conditions, found: Findings) -> dict[str, float]:
+    """True values of what was measured, as far as the twin has them."""
+    truth = dict[str, float]()
+    for name in found.estimates:
+        group, _, rest = name.partition(".")
+        if group == "conditions":
+            part, field = rest.split(".")
+            truth[name] = float(getattr(getattr(conditions, part), field))
+        elif group in Rig.model_fields:
+            truth[name] = rig.number(name)
+    return truth
+
+
+def judge(found: Findings, truth: Mapping[str, float]) -> Metrics:
+    """Errors over sigmas by name, and the share of those within 1.96."""
+    off = {name: (found.estimates[name].value - true) / found.estimates[name].sigma for name, true in truth.items()}
+    inside = np.abs(list(off.values())) < 1.96
+    figures: Metrics = {"measured": len(off), "held": int(inside.sum()), "held_share": float(inside.mean())}
+    return figures | {f"{name.replace('.', '_')}_over_sigma": float(value) for name, value in off.items()}
+
+
+EXPERIMENT = Experiment(("rig", "poses"), measure, {"held_share": ""}, counts=("measured", "held"))
