@@ -73,7 +73,7 @@ class CutBodyLimits:
     around: float = 0.8  # share of what lies beside one that begins at the face that is tissue: gel has little
     thick: float = 0.3  # of its lesser width, that of such a one: gel on a curved skin is thinner
     bump_mm: float = 6.0  # by which the dark behind the tissue begins before its median, over as wide a place: a body's shadow
-    rim: float = 0.5  # share of that place's rim with dark behind it: at the tissue's edge it begins early
+    rim: float = 0.4  # share of that place's rim with dark behind it: at the tissue's edge it begins early
     behind: float = 0.5  # share of another body within its shadow, which can't be cleared
 
 
