@@ -236,7 +236,7 @@ def find_lens(
     name : str
         Of the camera.
     focal_length : Estimate, optional
-        mm, as engraved on the lens, or as of `find_focal_length`. The f-number is this over the entrance pupil.
+        mm, as engraved on the lens, or as calibrated, by the pixels' size. The f-number is this over the entrance pupil.
     print_mm : float
         Spread of the printed edges, as a standard deviation along a line, that is taken as likely; 0 for one etched in
         glass. An office printer's are spread over some 0.05 mm from 10 to 90 %, which is 0.02 mm.
@@ -280,22 +280,6 @@ def find_lens(
         most = np.sqrt(max(blur2, 0) + 2 * spread)
         unknown[fields_of["blur_px"]] = f"below {most:.2f} px, not told from the defocus: {seen}"
     return Findings(estimates, unknown)
-
-
-def find_focal_length(
-    camera: Camera, name: str = "cam1", *, pixel_um: float | None = None, focal_sigma_px: float = 0.0
-) -> Findings:
-    """A lens's focal length in mm by its calibration in px and the pixel's size, as of the sensor's data sheet.
-
-    It is the image's distance, as the twin takes it. What is engraved on a lens is a nominal value, for a far focus, and differs
-    by a few per cent.
-    """
-    field = f"{name}.lens.focal_length_mm"
-    if pixel_um is None:
-        return Findings(unknown={field: f"needs the pixel's size: {camera.matrix[0, 0]:.1f} px is all that images show"})
-    scale = pixel_um * 1e-3
-    source = f"{camera.matrix[0, 0]:.1f} px of {pixel_um:g} um"
-    return Findings({field: Estimate(float(camera.matrix[0, 0] * scale), focal_sigma_px * scale, source)})
 
 
 class _Fit(NamedTuple):

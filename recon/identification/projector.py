@@ -43,17 +43,25 @@ BESIDE = 0.5  # 1/m, from the surface's own vergence: where searches for the pla
 FRAMES = np.array([0.02, 1.0, 0.05])  # standard deviations of gains, offsets in 8-bit DN, and shifts in steps, to begin with
 MOST_FRAMES = np.array([0.2, 20.0, 0.2])
 LEAST_FRAMES = np.array([1e-5, 1e-3, 1e-5])
+LENS = [BLUR, APERTURE, VERGENCE]
+LENS_ERROR = 1.25  # of their standard deviations: 25 renders of a plane, a sphere and a breast left z-scores of 1.1 to 1.4
+LEAST_BLUR_ERROR_PX = 0.01  # the mean error in the same renders, most on the sphere: a pixel's view of what is bent
 LOOSE = 5.0  # standard deviations of the decoded coordinate, of a prior around it: it costs a 25th of its information
 LEAST_LOOSE_PX = 0.1
 LOOSE_ORIGIN = 0.2  # steps, standard deviation of the prior of a set's origin
 LONGEST_PX = 0.3  # step of a coordinate
 CLEAR = 3.0  # standard deviations of noise, from which on nothing is clipped
+BLIND = 1e-9  # of the best known direction: one that is known less is one that the images can not show
+SHIFTS = 2  # among gains, offsets and shifts
+FAITHFUL = 1.5  # times the noise, which residuals of a faithful model reach at most
+FRINGES = 8  # images, that show frames' errors by themselves
 FEW = 1000  # pixels of a search
 COARSE, FINE = Rules(damping=1e-2, converged=1e-5, steps=25), Rules(converged=1e-7, steps=8)
 ODD = 6.0  # times the median of the pixels' mean squares, from which on a pixel loses weight: an edge, a moving thread
 ROUNDS = 3  # of weights and of the frames' standard deviations
 TOLD = 4.0  # standard deviations of black, from which on there is some
 NINETY_FIVE = 1.96  # standard deviations to each side, of an interval of 95 %
+BLACK_ERROR = 1.3  # of its standard deviation: coordinates and frames err, too; 45 computed projectors left z-scores of 1.3
 KNOWN_NOISE = 0.1  # relative error of the noise's variance, with what coordinates and frames take from it
 DARKEST_GREY = 0.5 / 255  # below, grey levels are black
 
@@ -67,13 +75,15 @@ class Selection:
     window: int = 5  # px, side of the neighbourhood in which the surface must be smooth
     modulation_dn: float = 10.0  # of 255, at least
     place_px: float = 0.2  # projector px, of a coordinate's noise at most: what is not linear in it counts as its square
+    steepest: float = 1.5  # slope of a coordinate over the image, in medians: in steep places shading bends what a pixel sees
     blocks: int = 10  # of the image along each side; pixels of a block may err together
     gamma: float = 0.1  # standard deviation at most; displays are set to 1.8 to 2.4
     blur_px: float = 0.1  # lenses blur by 0.3 to 0.8 px
     aperture: float = 0.12  # relative; projectors' lenses are of f/1.7 to f/2.8
     vergence_per_m: float = 0.12  # 50 mm at 650 mm
     margin: float = 12.0  # of the cost, by which a focus in front of the surface must differ from one behind it
-    modes: float = 3.0  # errors of frames, of which a standard deviation can be taken
+    modes: float = 3.0  # errors of frames, of which a standard deviation can be taken,
+    frames: tuple[float, float, float] = (0.005, 0.3, 0.02)  # or else least sigmas of flicker, stray light in DN, shift in steps
 
 
 USUAL = Selection()
@@ -232,7 +242,10 @@ def sample(
     slopes = {axis: _slopes(maps[axis][0], v, u, selection.window) for axis in axes}
     smooth = np.ones(len(v), bool)
     for axis, (across, down, rest) in slopes.items():
-        smooth &= rest < 3 * maps[axis][1][v, u] + 0.1 * np.hypot(across, down)
+        slope = np.hypot(across, down)
+        smooth &= rest < 3 * maps[axis][1][v, u] + 0.1 * slope
+        if slope.size:
+            smooth &= slope < selection.steepest * np.median(slope)
     kept = np.flatnonzero(smooth)
     kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), selection.pixels)).astype(int)] if kept.size else kept
     if len(kept) < selection.fewest:
@@ -287,7 +300,7 @@ class State(NamedTuple):
     """An estimate."""
 
     shared: Array  # (5,)
-    frames: Array  # (3, n) gains, offsets in DN, shifts in steps
+    frames: Array  # (3, n) logarithms of gains, whose mean only scales albedos; offsets in DN; shifts in steps
     places: dict[Axis, Array]  # (p,) projector px
 
 
@@ -437,7 +450,7 @@ class Model:
     def shade(self, state: State, light: Array, chosen: NDArray | slice = slice(None)) -> tuple[Array, Array]:
         """Albedo and ambient : (p,) DN by weighted least squares, for the light of the patterns : (n, p)."""
         gains, offsets, _ = state.frames
-        seen, weights = (1 + gains)[:, None] * light, self.weights[:, chosen]
+        seen, weights = np.exp(gains)[:, None] * light, self.weights[:, chosen]
         levelled = self.pixels.images[:, chosen] - offsets[:, None]
         total = weights.sum(axis=0)
         middle, level = (weights * seen).sum(axis=0) / total, (weights * levelled).sum(axis=0) / total
@@ -448,7 +461,7 @@ class Model:
         """The patterns' light : (n, p), albedo and ambient : (p,) DN, and what is expected in the images : (n, p) DN."""
         light = self.see(state, mirrors_of(self.patterns, state.shared[GAMMA], state.frames[2], self.rounded_at)).light
         albedo, ambient = self.shade(state, light)
-        return light, albedo, ambient, albedo * (1 + state.frames[0])[:, None] * light + ambient + state.frames[1][:, None]
+        return light, albedo, ambient, albedo * np.exp(state.frames[0])[:, None] * light + ambient + state.frames[1][:, None]
 
     def linearise(self, state: State) -> tuple[System, float]:
         """Normal equations at an estimate, and the cost."""
@@ -468,13 +481,13 @@ class Model:
             chosen = np.flatnonzero(self.pixels.block == block)
             seen = self.see(state, table, chosen)
             albedo, ambient = self.shade(state, seen.light, chosen)
-            bright = albedo * (1 + state.frames[0])[:, None]
+            bright = albedo * np.exp(state.frames[0])[:, None]
             root = np.sqrt(self.weights[:, chosen])
             rest = root * (self.pixels.images[:, chosen] - bright * seen.light - ambient - state.frames[1][:, None])
             slopes = np.zeros((len(chosen), len(rest), size))
             slopes[:, :, :5] = (bright * seen.by_shared).transpose(2, 1, 0)
             first = len(SHARED)
-            of_frames = albedo * seen.light, np.ones_like(rest), bright * seen.by_shift
+            of_frames = bright * seen.light, np.ones_like(rest), bright * seen.by_shift
             for used, values in zip(self.frames_used, of_frames, strict=True):
                 slopes[:, used, first + np.arange(len(used))] = values[used].T
                 first += len(used)
@@ -482,7 +495,7 @@ class Model:
                 slopes[:, :, -1] = (bright * seen.by_bend).T
             slopes *= root.T[:, :, None]
             mine = np.empty((len(chosen), len(rest), own_size))
-            mine[:, :, 0], mine[:, :, 1] = (root * (1 + state.frames[0])[:, None] * seen.light).T, root.T
+            mine[:, :, 0], mine[:, :, 1] = (root * np.exp(state.frames[0])[:, None] * seen.light).T, root.T
             drawn = np.zeros((len(chosen), own_size))
             for k, axis in enumerate(axes):
                 along = np.array([mirrors.axis == axis for mirrors in table])[:, None]
@@ -584,12 +597,14 @@ def fit(
         start = State(shared, np.zeros((3, patterns.count)), _decoded(model.pixels.some(few)))
         sides.append(_descended(model.of(few), start, COARSE).estimate)
     sides.sort(key=lambda side: model.of(few).linearise(side)[1])
-    state, scatters = State(sides[0].shared, sides[0].frames, _decoded(pixels)), []
+    state, scatters, frame_sigma = State(sides[0].shared, sides[0].frames, _decoded(pixels)), [], model.frame_sigma
     for _ in range(ROUNDS):
         state, system, *_ = _descended(model, state, FINE)
         *_, shown = model.show(state)
-        scatters = _scatters(model, state, system, unit, shown)
-        frame_sigma = np.maximum([one.value for one in scatters], LEAST_FRAMES) * unit
+        excess2 = (model.weights * (pixels.images - shown) ** 2).sum() / (shown.size - system.pulled.size)
+        scatters = _scatters(model, state, system, unit, excess2)
+        if excess2 < FAITHFUL**2:
+            frame_sigma = np.maximum([one.value for one in scatters], LEAST_FRAMES) * unit
         weights = 1 / (noise.read_variance + noise.gain * np.maximum(shown, 0))
         squares = (weights * (pixels.images - shown) ** 2).mean(axis=0)
         model = replace(
@@ -605,6 +620,8 @@ def fit(
     free = pixels.images.size - reduced.own.size - len(reduced.right)
     precision = np.pad(model.precision, (0, 1)) if grey else model.precision
     covariance = _by_blocks(system, reduced, precision)
+    covariance[np.ix_(LENS, LENS)] *= LENS_ERROR**2
+    covariance[BLUR, BLUR] += LEAST_BLUR_ERROR_PX**2
     step = np.linalg.solve(reduced.normal, reduced.right)
     bend = Estimate(float(step[-1]), float(np.sqrt(covariance[-1, -1])), "the fit") if grey else Estimate(0, np.inf, "no greys")
     light, albedo, ambient, shown = model.show(state)
@@ -612,7 +629,7 @@ def fit(
     return Response(
         shared=state.shared,
         covariance=covariance[:5, :5],
-        gains=state.frames[0],
+        gains=np.expm1(state.frames[0]),
         offsets=state.frames[1],
         shifts=state.frames[2],
         flicker=scatters[0],
@@ -641,25 +658,32 @@ def _decoded(pixels: Pixels) -> dict[Axis, Array]:
     return {axis: one.place for axis, one in pixels.along.items()}
 
 
-def _scatters(model: Model, state: State, system: System, unit: Array, shown: Array) -> list[Scatter]:
-    """Standard deviations of the frames' gains, offsets in 8-bit DN, and shifts in steps."""
+def _scatters(model: Model, state: State, system: System, unit: Array, excess2: float) -> list[Scatter]:
+    """Standard deviations of the frames' gains, offsets in 8-bit DN, and shifts in steps.
+
+    The mean shift of a set is its origin's. Where the model leaves much, light spreads farther than blur does, and binary images
+    differ by that: only differences within sets of fringes count.
+    """
     found, first, off, normal = [], len(SHARED), model.off_prior(state), system.reduced().normal
-    excess2 = (model.weights * (model.pixels.images - shown) ** 2).sum() / (shown.size - system.pulled.size)
-    for used, most, one in zip(model.frames_used, MOST_FRAMES, unit, strict=True):
+    precision, places = model.precision, [places - model.sets[0][0] for places in model.sets]
+    grey = model.frames_used[2]
+    for number, (used, most, one) in enumerate(zip(model.frames_used, MOST_FRAMES, unit, strict=True)):
+        if not len(used):
+            found.append(Scatter(0.0, np.inf, 0.0))
+            continue
         mine = np.arange(first, first + len(used))
         first += len(used)
         others = np.setdiff1d(np.arange(len(normal)), mine)
         crossed = normal[np.ix_(mine, others)]
         marginal = normal[np.ix_(mine, mine)] - crossed @ np.linalg.solve(normal[np.ix_(others, others)], crossed.T)
-        if not len(used):
-            found.append(Scatter(0.0, np.inf, 0.0))
-            continue
-        information, pull = marginal - model.precision[np.ix_(mine, mine)], marginal @ off[mine]
-        for group in [places - mine[0] for places in model.sets if places[0] in mine]:  # without the mean, which is the origin's
-            loaded = information[:, group].sum(axis=1)
-            total = max(float(loaded[group].sum()), 1e-300)
-            pull = pull - loaded * pull[group].sum() / total
-            information = information - np.outer(loaded, loaded) / total
+        information, pull = marginal - precision[np.ix_(mine, mine)], marginal @ off[mine]
+        odd = excess2 > FAITHFUL**2 and len(grey) >= FRINGES
+        if number == SHIFTS or odd:
+            means = [np.isin(used, grey[mean]).astype(float) for mean in places]
+            alone = [np.eye(len(used))[k] for k in range(len(used)) if used[k] not in grey]
+            loaded = information @ (free := np.array(means + alone).T)
+            solve = np.linalg.pinv(free.T @ loaded, rcond=BLIND, hermitian=True)
+            information, pull = information - loaded @ solve @ loaded.T, pull - loaded @ solve @ (free.T @ pull)
         found.append(scatter(information * one**2 / excess2, pull * one / excess2, most))
     return found
 
@@ -726,50 +750,58 @@ def findings(response: Response, patterns: Patterns, focal_length_mm: float, sel
             "a surface with more depth parts them"
         )
         unknown |= {f"projector.lens.{name}": why for name in ("blur_px", "f_number", "focus_mm")}
-    for name, one in (("flicker", response.flicker), ("stray_dn", response.stray), ("shift", response.shift)):
-        if np.isfinite(one.sigma) and (one.modes > selection.modes or one.value < 3 * LEAST_FRAMES[0]):
+    scatters = {"flicker": response.flicker, "stray_dn": response.stray, "shift": response.shift}
+    for (name, one), usual in zip(scatters.items(), selection.frames, strict=True):
+        if one.modes > selection.modes or one.sigma < usual:
             estimates[f"conditions.frames.{name}"] = Estimate(one.value, one.sigma, f"differences of {source}")
         else:
-            unknown[f"conditions.frames.{name}"] = f"{one.modes:.1f} of its errors show in {patterns.count} images"
+            unknown[f"conditions.frames.{name}"] = f"its standard deviation is {one.sigma:.2g}: too few frames show it"
     return Findings(estimates, unknown)
 
 
 def contrast(response: Response, room: NDArray | None, *, bits: int = 8) -> Findings:
-    """Contrast of full on to full off, by what is left of the ambient light without the room's.
+    """Contrast C of full on to full off, by the black of `black`, which is `1 / (C - 1)` of the patterns' share.
 
-    With the patterns' share `a = A (1 - 1 / C)` and black `A / C` above the room, black is `a / (C - 1)`, whereas stray light of
-    the frames is the same in all pixels: black is what goes with the albedo. Noise of albedo and ambient light, which the same
-    images show, is correlated; their covariance is taken off the sums [Fuller 1987]. The estimate is the middle of the interval
-    of 95 %, which is skewed.
+    The estimate is the middle of the interval of 95 %, which is skewed. Without images of the room it is unknown.
     """
     name = "projector.contrast"
-    albedo, ambient = response.albedo, response.ambient
     if room is None:
-        most = float(np.quantile(ambient / albedo, 0.05))
+        most = float(np.quantile(response.ambient / response.albedo, 0.05))
         why = f"black and room light add up, so that it is {_least(most)} or more; images with the projector covered part them"
         return Findings(unknown={name: why})
-    u, v = response.pixels.uv.T
-    frames = np.asarray(room, float).reshape(-1, *np.shape(room)[-2:])[:, v, u]
-    black = ambient - frames.mean(axis=0)
-    weights = (1 + response.gains)[:, None] ** np.array([0, 1, 2])[:, None, None] / response.noise_dn**2
-    one, light, light2 = (weights * response.light ** np.array([0, 1, 2])[:, None, None]).sum(axis=1)
-    determinant = (one * light2 - light**2) / response.excess**2
-    own, shared = float((one / determinant).sum()), float((-light / determinant).sum())
-    stray = response.stray.value * 2.0 ** (bits - 8) * np.sqrt(1 / len(frames) + 1 / len(response.light))
-    products = np.array([[(albedo**2).sum() - own, albedo.sum()], [albedo.sum(), len(albedo)]])
-    sums = np.array([(albedo * black).sum() - shared, black.sum()])
-    ratio, offset = np.linalg.solve(products, sums)
-    variance = np.mean((black - ratio * albedo - offset) ** 2)
-    products[1, 1] += variance / max(stray, 1e-3) ** 2
-    ratio = float(np.linalg.solve(products, sums)[0])
-    inverse = np.linalg.inv(products)
-    sigma = float(np.hypot(np.sqrt(variance * inverse[0, 0]), KNOWN_NOISE * shared * inverse[0, 0]))
+    ratio, sigma = black(response, room, bits=bits)
     if ratio < TOLD * sigma:
         why = f"black isn't told from stray light and noise, so that it is {_least(max(ratio, 0) + 2 * sigma)} or more"
         return Findings(unknown={name: why})
     least, most = 1 / (ratio + NINETY_FIVE * sigma), 1 / (ratio - NINETY_FIVE * sigma)
-    source = f"{len(frames)} image{'s' if len(frames) > 1 else ''} with the projector covered"
+    source = "the surface with the projector on black, and covered"
     return Findings({name: Estimate(1 + (least + most) / 2, (most - least) / (2 * NINETY_FIVE), source)})
+
+
+def black(response: Response, room: NDArray, *, bits: int = 8) -> tuple[float, float]:
+    """The projector's black as a share of the patterns' light, and its standard deviation.
+
+    Stray light of the frames is the same in all pixels, whereas black goes with the albedo. Noise of albedo and ambient light,
+    which the same images show, is correlated; its variances are taken off the sums [Fuller 1987].
+
+    room : (h, w) or (m, h, w), DN, with the projector covered.
+    """
+    u, v = response.pixels.uv.T
+    frames = np.asarray(room, float).reshape(-1, *np.shape(room)[-2:])[:, v, u]
+    albedo, dark = response.albedo, response.ambient - frames.mean(axis=0)
+    seen, weights = (1 + response.gains)[:, None] * response.light, (response.excess * response.noise_dn) ** -2.0
+    one, once, twice = ((weights * seen**power).sum(axis=0) for power in range(3))
+    determinant = one * twice - once**2
+    own, shared = float((one / determinant).sum()), float((-once / determinant).sum())
+    products = np.array([[(albedo**2).sum() - own, albedo.sum()], [albedo.sum(), len(albedo)]])
+    sums = np.array([(albedo * dark).sum() - shared, dark.sum()])
+    ratio, offset = np.linalg.solve(products, sums)
+    variance = np.mean((dark - ratio * albedo - offset) ** 2)
+    stray = max(response.stray.value * 2.0 ** (bits - 8), LEAST_FRAMES[1])
+    products[1, 1] += variance / (stray**2 * (1 / len(frames) + 1 / len(seen)))
+    inverse = np.linalg.inv(products)
+    sigma = np.hypot(np.sqrt(variance * inverse[0, 0]), KNOWN_NOISE * shared * inverse[0, 0])
+    return float((inverse @ sums)[0]), BLACK_ERROR * float(sigma)
 
 
 def _least(most: float) -> str:

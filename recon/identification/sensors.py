@@ -47,7 +47,8 @@ class SensorLimits:
     dark: float = 0.3  # of dark noise and DSNU, at most; a DSNU is known as well where it is surely less than the noise
     dark_noise_e: float = 40.0  # at most; where no dark frames measure it
     line: float = 0.002  # relative error of K by what isn't in the model, such as steps of the ADC in the noise
-    shape: float = 0.03  # relative error of a DSNU by noise that isn't normal, such as the few electrons' of dark current
+    coarse: float = 0.5  # DN of dark noise, under which the steps of the image hide most of it:
+    shape: float = 0.03  # relative error of a DSNU then, by noise that isn't normal, such as the few electrons' of dark current
 
 
 LIMITS = SensorLimits()
@@ -237,7 +238,8 @@ def _from_dark(
     else:
         unknown["dark_noise_e"] = steps.format(fit.noise.high)
     if fit.spread.sigma < LIMITS.dark * fit.spread.value or fit.spread.high < fit.noise.low:
-        known["dsnu_e"] = Estimate(fit.spread.value, float(np.hypot(fit.spread.sigma, LIMITS.shape * fit.spread.value)), both)
+        shape = LIMITS.shape * fit.spread.value if gain * fit.noise.value < LIMITS.coarse else 0.0
+        known["dsnu_e"] = Estimate(fit.spread.value, float(np.hypot(fit.spread.sigma, shape)), both)
     else:
         unknown["dsnu_e"] = steps.format(fit.spread.high)
     found |= Findings({n + name: one for name, one in known.items()}, {n + name: why for name, why in unknown.items()})

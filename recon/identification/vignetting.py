@@ -202,46 +202,6 @@ def find_vignetting(whites: Whites, name: str = "cam1", *, black: Estimate, limi
     return Findings(estimates, unknown)
 
 
-def find_flat_vignetting(
-    flats: Sequence[NDArray], camera: Camera, name: str = "cam1", *, black: Estimate, uneven: float = 0.01, full: float = 255
-) -> Findings:
-    """Find a camera's vignetting from images of an evenly bright surface, such as a screen close to the lens.
-
-    Parameters
-    ----------
-    flats : sequence of (h, w) DN
-        Of the surface in other places or turns; a slope of its brightness is fitted to each.
-    black : Estimate
-        DN of a pixel without light.
-    uneven : float
-        Standard deviation of the surface's own loss towards the corners, relative, in each image; a screen moved between
-        images averages it.
-    """
-    key, block = f"{name}.lens.vignetting", 16  # px: pixels count by their mean
-    grid = camera.pixel_grid()
-    ideal = camera.undistort(grid)
-    cosine4 = (1 + (ideal**2).sum(axis=-1)) ** -2
-    at = (grid - _middle(camera)) / np.linalg.norm(_middle(camera))
-    found, sigmas = [], []
-    for flat in flats:
-        clear = _blocks(np.where(np.asarray(flat) >= full, np.nan, flat), block) - black.value
-        corrected, x, y = clear / _blocks(cosine4, block), *(_blocks(at[..., k], block) for k in range(2))
-        good = np.isfinite(corrected)
-        columns = np.column_stack([np.ones(good.sum()), x[good], y[good], x[good] ** 2 + y[good] ** 2])
-        values, *_ = np.linalg.lstsq(columns, corrected[good], rcond=None)
-        left = corrected[good] - columns @ values
-        known = np.linalg.inv(columns.T @ columns) * left.var()
-        by_black = -values[3] / values[0] ** 2
-        found.append(-values[3] / values[0])
-        sigmas.append(np.sqrt(known[3, 3]) / values[0] + abs(by_black) * black.sigma)
-    if not found:
-        return Findings(unknown={key: "needs images of an evenly bright surface, found none"})
-    noise = np.sqrt(np.mean(np.square(sigmas)) / len(found))
-    common = max(uneven, float(np.std(found, ddof=1)) if len(found) > 2 else 0.0) / np.sqrt(len(found))
-    sigma = float(np.hypot(noise, common))
-    return Findings({key: Estimate(float(np.mean(found)), sigma, f"{len(found)} images of an evenly bright surface")})
-
-
 def _between(centres: Array, board: Discs, limits: WhiteLimits) -> tuple[Array, Array, Array]:
     """Places between discs : (k, 3) mm in the board's frame, distances from the nearest rim : (k,) mm, and `Whites.place`."""
     low, high = centres.min(axis=0), centres.max(axis=0)
@@ -293,9 +253,3 @@ def _white_terms(place: Array) -> Array:
 
 def _middle(camera: Camera) -> Array:
     return (np.array(camera.size) - 1) / 2
-
-
-def _blocks(values: NDArray, side: int) -> Array:
-    """Means of square blocks : (h // side, w // side); NaN where one is."""
-    height, width = (length // side * side for length in values.shape)
-    return values[:height, :width].reshape(height // side, side, width // side, side).mean(axis=(1, 3))

@@ -12,6 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
 from recon.capture.board_part import BoardCapture
 from recon.capture.images import image_files, read_images
@@ -113,6 +114,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}")
 
 
+@linear_algebra.on_one_thread()
 def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
     """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
     manifest = read_manifest(settings.capture)

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from recon.board_detection.discs import measure
-from recon.geometry.camera import Camera
 from recon.geometry.ellipses import Ellipses
 from recon.identification.estimates import Estimate
-from recon.identification.lenses import Rims, find_focal_length, find_lens, fitted_width, joined, measure_rims, widths
+from recon.identification.lenses import Rims, find_lens, fitted_width, joined, measure_rims, widths
 from tests.recon.identification import lit_boards
 from tests.recon.identification.exact_discs import SIDE, share
 
@@ -86,17 +85,17 @@ def test_a_lens_is_found_by_its_blur(rng, blur, disc_mm):
 
 @pytest.mark.slow
 def test_intervals_cover_the_lens(rng):
-    """Of 100 lenses: 90 to 98 % of the intervals of 95 %, but for the chance of a hundred draws."""
+    """Of 50 lenses: 90 to 98 % of the intervals of 95 %, but for the chance of fifty draws."""
     z = {field: [] for field in FIELDS}
-    for _ in range(100):
+    for _ in range(50):
         number, focus, blur = rng.uniform(4, 11), rng.uniform(450, 900), rng.uniform(0.3, 0.9)
         rims = edges(rng, rng.uniform(560, 760, 96), FOCAL_MM / number, focus, blur, 2.0)
         for field, value in scored(find_lens(rims, focal_length=ENGRAVED, print_mm=0), (number, focus, blur)).items():
             z[field].append(value)
     for values in z.values():
-        assert len(values) > 60
-        assert np.mean(np.abs(values) < 1.96) >= 0.89
-        assert np.std(values) == pytest.approx(1, abs=0.25)
+        assert len(values) > 30
+        assert np.mean(np.abs(values) < 1.96) >= 0.86
+        assert np.std(values) == pytest.approx(1, abs=0.3)
 
 
 def test_one_depth_does_not_tell_the_aperture(rng):
@@ -126,12 +125,6 @@ def test_a_point_spread_that_varies_over_the_image_counts_to_sigma(rng):
     varied = find_lens(Rims(softer, *(getattr(rims, name) for name in list(rims.__dataclass_fields__)[1:])))
     found = varied.estimates["cam1.lens.blur_px"]
     assert found.sigma > 2 * even.sigma and "varying by 0.0" in found.source
-
-
-def test_a_focal_length_in_mm_needs_the_pixel():
-    camera = Camera((640, 512), np.array([[1660.0, 0, 319.5], [0, 1660, 255.5], [0, 0, 1]]), np.zeros(5))
-    assert "cam1.lens.focal_length_mm" in find_focal_length(camera).unknown
-    assert find_focal_length(camera, pixel_um=9.6).estimates["cam1.lens.focal_length_mm"].value == pytest.approx(15.936)
 
 
 @pytest.mark.slow

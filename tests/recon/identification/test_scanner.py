@@ -76,16 +76,16 @@ def test_wires_show_apertures_and_the_slice():
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth():
-    """24 scanners: 95 % of intervals cover, of some 250 that aren't independent within a scanner; 88 % at least pass."""
+    """12 scanners: 95 % of intervals cover, of some 125 that aren't independent within a scanner; 86 % at least pass."""
     off: list[float] = []
-    for seed in range(24):
+    for seed in range(12):
         array, attenuation, rng = scanner_draws.drawn(seed)
         found = scanner.identify(
             scanner_draws.recorded(array, attenuation, seed), scanner_draws.sheet_of(array, attenuation, rng)
         )
         off += scanner_draws.deviations(found, array).values()
-    assert len(off) > 200
-    assert (np.abs(off) < 1.96).mean() > 0.88
+    assert len(off) > 100
+    assert (np.abs(off) < 1.96).mean() > 0.86
 
 
 @pytest.mark.slow
