@@ -28,6 +28,7 @@ class TransferLimits:
 
     dithered_dn: float = 0.6  # noise that hides the steps of whole numbers: the variance of rounding is 1/12 DN^2 to 2e-3 DN^2
     margin: float = 5.0  # standard deviations between a tile's mean and the ends of the range
+    uneven: float = 0.002  # relative error of a variance by what isn't in the model, such as steps of the ADC in the noise
     tiles: int = 16  # at least; their scatter is the line's uncertainty
     harmonics: int = 3  # of fringes, which a projector's gamma adds with some strength, and which are left out
     locked: int = 5  # harmonics of the fringes that a frame's error may show in a tile
@@ -148,7 +149,8 @@ def _orthonormal(shapes: Array) -> Array:
 def transfer_line(noise: TileNoise) -> PhotonTransfer | None:
     """Fit the line of variance over level, with weights by itself.
 
-    Its standard deviations are those by the tiles' degrees of freedom, times the tiles' scatter about it where that is larger.
+    Its standard deviations are those by the tiles' degrees of freedom, times the tiles' scatter about it where that is larger,
+    and by errors of the variances at its ends.
     None if too few tiles have a noise that hides the steps of whole numbers, or their levels don't differ.
     """
     x, y = noise.level, noise.variance - ROUNDING
@@ -164,7 +166,9 @@ def transfer_line(noise: TileNoise) -> PhotonTransfer | None:
         (gain, intercept), *_ = np.linalg.lstsq(waves, y[used] * root, rcond=None)
         scatter = ((y[used] * root - waves @ [gain, intercept]) ** 2).sum() / (len(root) - 2)
         covariance = np.linalg.inv(waves.T @ waves) * max(scatter, 1.0)
-        line = PhotonTransfer(float(gain), float(intercept), covariance, float(x[used].min()), float(x[used].max()))
+        ends = np.array([x[used].min(), x[used].max()])
+        by_ends = np.linalg.inv(np.stack([ends, np.ones(2)], axis=1)) * LIMITS.uneven * (intercept + gain * ends + ROUNDING)
+        line = PhotonTransfer(float(gain), float(intercept), covariance + by_ends @ by_ends.T, *ends.tolist())
         expected = np.maximum(line.variance(x), ROUNDING)
         used = line.variance(x) - ROUNDING > LIMITS.dithered_dn**2
     return line

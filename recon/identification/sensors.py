@@ -46,9 +46,9 @@ class SensorLimits:
     gain: float = 0.2  # relative standard deviation of K, at most
     dark: float = 0.3  # of dark noise and DSNU, at most; a DSNU is known as well where it is surely less than the noise
     dark_noise_e: float = 40.0  # at most; where no dark frames measure it
-    line: float = 0.002  # relative error of K by what isn't in the model, such as steps of the ADC in the noise
+    one_value: float = 0.3  # DN, scatter of dark frames that show one value: the black level lies anywhere within its step
     coarse: float = 0.5  # DN of dark noise, under which the steps of the image hide most of it:
-    shape: float = 0.03  # relative error of a DSNU then, by noise that isn't normal, such as the few electrons' of dark current
+    shape: float = 0.025  # relative error of a DSNU then, by noise that isn't normal, such as the few electrons' of dark current
 
 
 LIMITS = SensorLimits()
@@ -216,7 +216,8 @@ def _from_dark(
         dark_e, dark_sigma = most / 2, most * UNIFORM
     number = gain if line else _range(settings, 0) / LIMITS.saturation_e
     black = fit.black.value - number * dark_e
-    black_sigma = float(np.hypot(np.hypot(fit.black.sigma, number * dark_sigma), step_sigma))
+    hidden = UNIFORM if float(np.std(stacks[0].frames)) < LIMITS.one_value else 0.0
+    black_sigma = float(np.linalg.norm([fit.black.sigma, number * dark_sigma, step_sigma, hidden]))
     found |= Findings({n + "black_level_dn": Estimate(max(black / full, 0.0), black_sigma / full, source)})
     if line is None:
         by_names = {"dark_noise_e": fit.noise, "dsnu_e": fit.spread}
@@ -254,8 +255,7 @@ def _saturation(settings: ImageSettings, gain: tuple[float, float], black: tuple
     """Electrons that fill the range, by K and the black level in DN, each with its standard deviation."""
     filled = _range(settings, black[0] / 2.0 ** (settings.bits - 8))
     value = filled / gain[0]
-    relative = np.linalg.norm([gain[1] / gain[0], black[1] / filled, LIMITS.line])
-    return Estimate(value, float(value * relative), source)
+    return Estimate(value, float(value * np.hypot(gain[1] / gain[0], black[1] / filled)), source)
 
 
 def _prnu(

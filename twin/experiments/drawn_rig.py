@@ -18,13 +18,17 @@ def draw(rig: Rig, seed: int) -> tuple[Rig, Conditions]:
     """Draw a rig and the conditions of its frames, the same for the same seed."""
     rng = np.random.default_rng([seed, 60])
     size, pixel_um = CAMERA_SIZES[rng.integers(len(CAMERA_SIZES))], PIXELS_UM[rng.integers(len(PIXELS_UM))]
-    cameras = {name: _camera(getattr(rig, name), size, pixel_um, rng) for name in ("cam1", "cam2")}
+    adc_bits = ADC_BITS[rng.integers(len(ADC_BITS))]
+    cameras = {name: _camera(getattr(rig, name), size, pixel_um, adc_bits, rng) for name in ("cam1", "cam2")}
     projector = _projector(rig.projector, PROJECTOR_SIZES[rng.integers(len(PROJECTOR_SIZES))], rng)
     frames = Frames(flicker=rng.uniform(0.002, 0.02), stray_dn=rng.uniform(0.1, 1.0), shift=rng.uniform(0.002, 0.05))
     return rig.model_copy(update={**cameras, "projector": projector}), Conditions(frames=frames)
 
 
-def _camera(device: CameraDevice, size: tuple[int, int], pixel_um: float, rng: np.random.Generator) -> CameraDevice:
+def _camera(
+    device: CameraDevice, size: tuple[int, int], pixel_um: float, adc_bits: int, rng: np.random.Generator
+) -> CameraDevice:
+    """A camera of a kind, which both of a rig share."""
     optics = _resized(device.optics, size, rng)
     focal_length = optics.focal_px[0] * pixel_um * 1e-3
     lens = device.lens.model_copy(
@@ -44,7 +48,7 @@ def _camera(device: CameraDevice, size: tuple[int, int], pixel_um: float, rng: n
             "dsnu_e": _between(rng, 1, 10),
             "prnu": _between(rng, 0.002, 0.015),
             "black_level_dn": rng.uniform(1, 8),
-            "adc_bits": ADC_BITS[rng.integers(len(ADC_BITS))],
+            "adc_bits": adc_bits,
         }
     )
     return device.model_copy(update={"optics": optics, "lens": lens, "sensor": sensor, "serial": int(rng.integers(2**31))})
