@@ -85,17 +85,18 @@ def test_a_lens_is_found_by_its_blur(rng, blur, disc_mm):
 
 @pytest.mark.slow
 def test_intervals_cover_the_lens(rng):
-    """Of 50 lenses: 90 to 98 % of the intervals of 95 %, but for the chance of fifty draws."""
+    """Of 20 lenses: 90 to 98 % of the intervals of 95 %, but for the chance of twenty draws; all together closer."""
     z = {field: [] for field in FIELDS}
-    for _ in range(50):
+    for _ in range(20):
         number, focus, blur = rng.uniform(4, 11), rng.uniform(450, 900), rng.uniform(0.3, 0.9)
         rims = edges(rng, rng.uniform(560, 760, 96), FOCAL_MM / number, focus, blur, 2.0)
         for field, value in scored(find_lens(rims, focal_length=ENGRAVED, print_mm=0), (number, focus, blur)).items():
             z[field].append(value)
     for values in z.values():
-        assert len(values) > 30
-        assert np.mean(np.abs(values) < 1.96) >= 0.86
-        assert np.std(values) == pytest.approx(1, abs=0.3)
+        assert len(values) > 12
+        assert np.mean(np.abs(values) < 1.96) >= 0.8
+        assert np.std(values) == pytest.approx(1, abs=0.4)
+    assert np.mean(np.abs(np.concatenate(list(z.values()))) < 1.96) >= 0.88
 
 
 def test_one_depth_does_not_tell_the_aperture(rng):
