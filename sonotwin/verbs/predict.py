@@ -14,7 +14,7 @@ aren't.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any
+from typing import Any
 
 from pydantic import Field, ValidationError
 
@@ -22,7 +22,6 @@ from recon.errors import InputError, one_line
 from recon.model.part import Finite, NotNegative, Part
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
-from recon.registry import Choice
 from scenes.kinds import plane
 from sonotwin.console_watch import LineConsole
 from twin.experiments import predicted_plane
@@ -47,20 +46,14 @@ class Change(Part):
 
 
 class Config(Part):
-    """Fields of `sonotwin predict`."""
+    """Fields of `conf/predict.yaml`."""
 
-    rig: Annotated[Rig, Choice("meza2021")]
-    """the instruments"""
-    patterns: Annotated[Patterns, Choice("paper_surface")]
-    """that the projector shows"""
+    rig: Rig
+    patterns: Patterns
+    tracing: Tracing
     plate: plane.Config = plane.Config()
-    """the plane that is measured"""
     shooting: Shooting = Shooting()
-    """exposure; set for the plane where it isn't given"""
-    tracing: Tracing = Tracing()
-    """of it, the room's light"""
     changes: dict[str, Change] = Field(default_factory=dict)
-    """fields by dotted names, each with another value and its price: {rig.projector.gamma: {to: 1.0, price: 0}}"""
 
 
 def run(config: Config) -> None:
