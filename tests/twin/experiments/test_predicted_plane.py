@@ -16,14 +16,17 @@ from twin.optics.surface_session import Shooting
 def measurement(rig, **fields) -> Measurement:
     parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=8, complementary=True))
     patterns = Patterns(projector_size=rig.projector.optics.size, unwrap="gray", parts=parts)
-    usual = {"plate": plane.PAPER_POSES[2], "shooting": Shooting(), "tracing": Tracing(samples=64, room_lux=20)}
+    usual = {"plate": plane.PAPER_POSES[2], "shooting": Shooting(), "tracing": Tracing(samples=1024, room_lux=20)}
     return Measurement(patterns, **usual | fields)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [201, 202, 203])
+@pytest.mark.parametrize("seed", [201, 202])
 def test_a_rendered_plane_is_as_far_off_as_is_predicted(rig, seed):
-    """Of rigs drawn at random, within 5 %; exposures, which are set for the brightest places, within 5 %."""
+    """Of rigs drawn at random, within 5 %, and so are exposures, which are set for the brightest places.
+
+    By many samples: of a coarse raster, nearly in focus, 16 leave 0.05 projector px of noise of their own, 64 half of it.
+    """
     drawn, _ = drawn_rig.draw(rig, seed)
     chosen = measurement(drawn)
     found = surface_accuracy.experiment(drawn, plane.build(chosen.plate), chosen.patterns, seed, chosen.tracing)
