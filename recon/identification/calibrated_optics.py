@@ -1,16 +1,14 @@
 """Devices of a rig as they were calibrated: pinholes, lenses' distortion, and places."""
 
-from typing import Any
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recon.geometry.camera import Camera
+from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.identification.estimates import Estimate, Findings
 from recon.model.calibration import WORLD, Calibration
 from recon.model.rig import Optics, Pose, Rig
 
-DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 SOURCE = "calibration by a board"
 
 
@@ -57,17 +55,18 @@ def findings(calibration: Calibration) -> Findings:
     if known is None:
         return Findings(unknown={f"{name}.optics": "the calibration has no covariance" for name in calibration.cameras})
     for name, camera in calibration.cameras.items():
-        fields = {"focal_px.0": "fx", "focal_px.1": "fy", "centre_px.0": "cx", "centre_px.1": "cy"}
-        fields |= {f"distortion.{k}": DISTORTION[k] for k in range(len(camera.distortion))}
+        optics = optics_of(camera)
+        numbers: dict[str, tuple[tuple[str, ...], tuple[float, ...]]]
+        numbers = {"focal_px": (MATRIX[:2], optics.focal_px), "centre_px": (MATRIX[2:], optics.centre_px)}
+        numbers["distortion"] = (DISTORTION, optics.distortion)
         if name != WORLD:
-            fields |= {f"device_from_world.translation_mm.{k}": f"t{axis}" for k, axis in enumerate("xyz")}
-            fields |= {f"device_from_world.rotation_deg.{k}": f"r{axis}" for k, axis in enumerate("xyz")}
-        optics = optics_of(camera).model_dump(mode="python")
-        for field, parameter in fields.items():
-            if f"{name}.{parameter}" in known.names:
-                value: Any = optics
-                for key in field.split("."):
-                    value = value[int(key) if key.isdecimal() else key]
-                unit = np.rad2deg(1.0) if "rotation" in field else 1.0
-                found[f"{name}.optics.{field}"] = Estimate(float(value), unit * known.sigma(f"{name}.{parameter}"), SOURCE)
+            pose = optics.device_from_world
+            numbers["device_from_world.translation_mm"] = (MOTION[3:], pose.translation_mm)
+            numbers["device_from_world.rotation_deg"] = (MOTION[:3], pose.rotation_deg)
+        for field, (parameters, values) in numbers.items():
+            unit = np.rad2deg(1.0) if "rotation" in field else 1.0
+            for k, (parameter, value) in enumerate(zip(parameters, values, strict=False)):
+                if f"{name}.{parameter}" in known.names:
+                    sigma = unit * known.sigma(f"{name}.{parameter}")
+                    found[f"{name}.optics.{field}.{k}"] = Estimate(value, sigma, SOURCE)
     return Findings(found)

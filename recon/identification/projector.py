@@ -23,7 +23,7 @@ from recon.estimation.levenberg_marquardt import Descent, Rules, Unreachable, de
 from recon.geometry import rigid
 from recon.geometry.camera import Camera, distorted
 from recon.identification.estimates import Estimate, Findings
-from recon.identification.frame_scatter import Scatter, scatter
+from recon.identification.frame_scatter import NINETY_FIVE, Scatter, scatter
 from recon.identification.projected_light import Footprint, mirror_weights
 from recon.model.patterns import Axis, Fringes, Patterns, Uniform
 from recon.structured_light.decode import ProjectorMap, Status
@@ -60,7 +60,6 @@ COARSE, FINE = Rules(damping=1e-2, converged=1e-5, steps=25), Rules(converged=1e
 ODD = 6.0  # times the median of the pixels' mean squares, from which on a pixel loses weight: an edge, a moving thread
 ROUNDS = 3  # of weights and of the frames' standard deviations
 TOLD = 4.0  # standard deviations of black, from which on there is some
-NINETY_FIVE = 1.96  # standard deviations to each side, of an interval of 95 %
 BLACK_ERROR = 1.3  # of its standard deviation: coordinates and frames err, too; 45 computed projectors left z-scores of 1.3
 KNOWN_NOISE = 0.1  # relative error of the noise's variance, with what coordinates and frames take from it
 DARKEST_GREY = 0.5 / 255  # below, grey levels are black
@@ -188,24 +187,9 @@ def identify(
     InputError
         If too few pixels are left, or no fringes place them.
     """
-    response = fit_response(images, patterns, found, points, devices, blur, bits=bits, selection=selection)
-    return findings(response, patterns, focal_length_mm, selection) | contrast(response, room, bits=bits)
-
-
-def fit_response(
-    images: NDArray,
-    patterns: Patterns,
-    found: ProjectorMap,
-    points: PointMap,
-    devices: tuple[Camera, Camera],
-    blur: CameraBlur,
-    *,
-    bits: int = 8,
-    selection: Selection = USUAL,
-) -> Response:
-    """Fit the response to some thousand pixels well inside surfaces; see `identify`."""
     pixels = sample(images, patterns, found, points, devices, blur, bits, selection)
-    return fit(pixels, patterns, found.noise, blur, bits=bits, selection=selection)
+    response = fit(pixels, patterns, found.noise, blur, bits=bits, selection=selection)
+    return findings(response, patterns, focal_length_mm, selection) | contrast(response, room, bits=bits)
 
 
 def sample(

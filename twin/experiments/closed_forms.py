@@ -41,13 +41,18 @@ def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
     The first harmonic of the waveform behind the projector's gamma, less what blurs it: the mirrors, `sinc(1 / pitch)`, and
     `transfer`.
     """
-    turn = 2 * np.pi * np.arange(WAVE) / WAVE
-    shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
-    black = 1 / rig.projector.contrast
-    light = black + (1 - black) * shown
+    turn, light = 2 * np.pi * np.arange(WAVE) / WAVE, waveform(rig, fringes, WAVE)
     first = 2 * np.mean(light * np.cos(turn))
     wave = np.array([1 / fringes.pitch])
     return float(first / light.mean() * np.sinc(wave).item() * transfer(rig, place, wave).item())
+
+
+def waveform(rig: Rig, fringes: Fringes, steps: int) -> Array:
+    """Light of the fringes over a period : (steps,), 1 for a pixel that is fully on, behind gamma and black, without blur."""
+    turn = 2 * np.pi * np.arange(steps) / steps
+    shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
+    black = 1 / rig.projector.contrast
+    return black + (1 - black) * shown
 
 
 def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
@@ -97,13 +102,21 @@ def plane_sigma(rig: Rig, plane: Plane, column_sigma: float) -> float:
 def _mm_a_column(camera: Camera, projector: Camera, plane: Plane) -> Array:
     """Distance from a plane, mm, by which a point moves a column of the projector, over what both see of it."""
     across, down = (np.linspace(0, length - 1, steps) for length, steps in zip(camera.size, GRID, strict=True))
-    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
+    return seen_points(camera, projector, plane, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))[1]
+
+
+def seen_points(camera: Camera, projector: Camera, plane: Plane, pixels: Array) -> tuple[Array, Array]:
+    """Points : (n, 3) mm of a plane at those pixels : (m, 2) of a camera that the projector reaches.
+
+    And by how much, mm, a point leaves the plane for a px of the projector's column : (n,).
+    """
+    rays = camera.rays(pixels)
     cosine = rays @ plane.normal
     points = camera.centre + rays * (((plane.point - camera.centre) @ plane.normal) / cosine)[:, None]
     columns = [projector.project(points + side * STEP_MM * rays) for side in (-1, 0, 1)]
     seen = ((columns[1] > -0.5) & (columns[1] < np.array(projector.size) - 0.5)).all(axis=1)
     slope = (columns[2] - columns[0])[:, 0] / (2 * STEP_MM)
-    return (np.abs(cosine) / np.abs(slope))[seen]
+    return points[seen], (np.abs(cosine) / np.abs(slope))[seen]
 
 
 def brightness_noise(camera: CameraDevice, brightness_dn: float, exposure: Exposure) -> float:

@@ -49,15 +49,19 @@ def measure(settings: Settings, seed: int) -> Metrics:
     """Errors over sigmas of all numbers that were measured, and how many of the 95 % intervals hold the truth."""
     rig, conditions = drawn_rig.draw(settings.rig, seed)
     with TemporaryDirectory() as folder:
-        out = Path(folder)
-        exposures = record_surface(rig, conditions, out, seed)
-        record_board(rig, conditions, out, settings.poses.seed + seed, seed)
-        record_frames(rig, exposures, out, seed)
-        chosen = rig_step.Settings(
-            capture=out / CAPTURE, rig=sheet_of(rig), dark=out / "dark", flat=out / "flat", adc_bits=rig.cam1.sensor.adc_bits
-        )
-        _, found = rig_step.identify(chosen)
+        _, found = identify_recorded(rig, conditions, Path(folder), settings.poses.seed + seed, seed)
     return judge(found, truth_of(rig, conditions, found))
+
+
+def identify_recorded(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> tuple[Rig, Findings]:
+    """Record a rig's captures in a folder, and identify it from these and its sheet."""
+    exposures = record_surface(rig, conditions, out, seed)
+    record_board(rig, conditions, out, poses_seed, seed)
+    record_frames(rig, exposures, out, seed)
+    chosen = rig_step.Settings(
+        capture=out / CAPTURE, rig=sheet_of(rig), dark=out / "dark", flat=out / "flat", adc_bits=rig.cam1.sensor.adc_bits
+    )
+    return rig_step.identify(chosen)
 
 
 def patterns_of(rig: Rig) -> Patterns:

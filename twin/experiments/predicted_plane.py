@@ -94,17 +94,13 @@ def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:
     """Points : (n, 3) mm of the plate that camera 1 and projector see, and the plane's error, mm, for a column's, px : (n,)."""
     camera, projector = rig.cam1.optics.camera(), rig.projector.optics.camera()
     across, down = ((np.arange(steps) + 0.5) / steps * length - 0.5 for length, steps in zip(camera.size, GRID, strict=True))
-    rays = camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
-    cosine = rays @ flat.normal
-    points = camera.centre + rays * (((flat.point - camera.centre) @ flat.normal) / cosine)[:, None]
-    columns = [projector.project(points + side * closed_forms.STEP_MM * rays) for side in (-1, 0, 1)]
-    slope = (columns[2] - columns[0])[:, 0] / (2 * closed_forms.STEP_MM)
-    seen = ((columns[1] > -0.5) & (columns[1] < np.array(projector.size) - 0.5)).all(axis=1)
+    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    points, mm_a_column = closed_forms.seen_points(camera, projector, flat, pixels)
     local = rigid.apply(rigid.invert(plane.tilted(plate.centre_mm, plate.tilt_deg)), points)
-    seen &= (np.abs(local[:, :2]) < np.array(plate.size_mm) / 2).all(axis=1)
+    seen = (np.abs(local[:, :2]) < np.array(plate.size_mm) / 2).all(axis=1)
     if not seen.any():
         raise ValueError("plate: expected it in view of camera 1 and the projector, found it in none or one of them")
-    return points[seen], (np.abs(cosine) / np.abs(slope))[seen]
+    return points[seen], mm_a_column[seen]
 
 
 def _radiance(rig: Rig, points: Array, normal: Array, reflectance: float) -> Array:
@@ -137,10 +133,7 @@ def _corner2(device: CameraDevice | ProjectorDevice, points: Array) -> Array:
 
 def _wave(rig: Rig, fringes: Fringes, place: Array) -> tuple[float, float, float]:
     """Mean, first harmonic's amplitude and peak of the fringes' light at a place with all blur, 1 for a pixel fully on."""
-    turn = 2 * np.pi * np.arange(WAVE) / WAVE
-    shown = (np.cos(turn) >= 0).astype(float) if fringes.waveform == "binary" else ((1 + np.cos(turn)) / 2) ** rig.projector.gamma
-    black = 1 / rig.projector.contrast
-    harmonics = np.fft.rfft(black + (1 - black) * shown) / WAVE
+    harmonics = np.fft.rfft(closed_forms.waveform(rig, fringes, WAVE)) / WAVE
     waves = np.arange(len(harmonics)) / fringes.pitch
     harmonics = harmonics * np.sinc(waves) * closed_forms.transfer(rig, place, waves)
     peak = float(np.fft.irfft(harmonics * WAVE).max())

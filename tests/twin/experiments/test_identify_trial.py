@@ -35,22 +35,10 @@ def test_the_sheet_holds_nothing_of_what_is_to_be_identified(rig):
 @pytest.mark.slow
 def test_a_drawn_rig_is_identified_from_its_images(rig, tmp_path, monkeypatch):
     """Of some 60 numbers at least 85 % within their 95 % intervals, all within 6 sigma; the focal lengths to 0.1 %."""
-    from recon.session import rig_step
-
     monkeypatch.setattr(identify_trial, "POSES", 8)
     seed = 51
     drawn, conditions = drawn_rig.draw(rig, seed)
-    exposures = identify_trial.record_surface(drawn, conditions, tmp_path, seed)
-    identify_trial.record_board(drawn, conditions, tmp_path, seed, seed)
-    identify_trial.record_frames(drawn, exposures, tmp_path, seed)
-    chosen = rig_step.Settings(
-        capture=tmp_path / "capture",
-        rig=identify_trial.sheet_of(drawn),
-        dark=tmp_path / "dark",
-        flat=tmp_path / "flat",
-        adc_bits=drawn.cam1.sensor.adc_bits,
-    )
-    found_rig, found = rig_step.identify(chosen)
+    found_rig, found = identify_trial.identify_recorded(drawn, conditions, tmp_path, seed, seed)
     figures = identify_trial.judge(found, identify_trial.truth_of(drawn, conditions, found))
     assert figures["measured"] > 50 and figures["held_share"] >= 0.85
     assert max(abs(value) for name, value in figures.items() if name.endswith("_over_sigma")) < 6
