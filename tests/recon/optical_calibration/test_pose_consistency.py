@@ -74,9 +74,24 @@ def test_a_device_that_is_touched_is_told(cameras, monkeypatch, moved):
     assert all(one.warning and one.rise > 1.3 for one in found)
 
 
+@pytest.mark.parametrize("sets", [1, pytest.param(6, marks=pytest.mark.slow)])
+def test_projector_coordinates_that_shift_from_pose_to_pose_are_told_and_count(cameras, monkeypatch, sets):
+    """By 0.05 px along each axis, as grey fringes do whose shifts err: found to a factor of two, and errors as predicted."""
+
+    def shifted(k, rng):
+        matrix = cameras["projector"].matrix.copy()
+        matrix[:2, 2] += 0.05 * rng.standard_normal(2)
+        return {**cameras, "projector": replace(cameras["projector"], matrix=matrix)}, BOARD.points()
+
+    found, squared = results(cameras, range(sets), monkeypatch, shifted)
+    assert all("coordinates shift" in one.warning and "bend" not in one.warning and one.rise > 1.3 for one in found)
+    assert all(0.025 < one.shift_px < 0.1 for one in found)
+    assert sets == 1 or 0.5 < squared < 1.8
+
+
 def test_what_hardly_raises_the_uncertainty_is_not_warned_of():
     """Residuals of 0.006 px that contradict each other twofold, and a bend of 0.3 um, beside a lens known far less."""
-    slight = Consistency(5.06, 0.00032, 2.5, 2.15, 1.001, np.eye(1))
+    slight = Consistency(5.06, 0.00032, 2.5, 0.0, 0.0, 2.15, 1.001, np.eye(1))
     assert slight.warning is None
     large = replace(slight, rise=1.7).warning
     assert "bend by 0.00032 mm" in large and "2.1 times the residuals" in large and "1.7 times as large" in large
