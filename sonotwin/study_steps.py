@@ -102,13 +102,25 @@ def search(config: "Config", goal: Goal, console: Console) -> bool:
         done = study_runs.in_order(trials, list(study_runs.run(place, config.of, trials, config.engine)))
         return _split(done, len(trials) // len(points))
 
-    trials_of([goal.start])  # refused before anything is written
+    def foresee(points: Sequence[Point]) -> list[list[Done]]:
+        trials = trials_of(points)
+        done = [Done(one, experiment_runs.predict_trial(config.of, one.settings, one.seed)) for one in trials]
+        return _split(done, len(trials) // len(points))
+
+    start = trials_of([goal.start])  # refused before anything is written
+    if goal.by == "prediction":
+        experiment_runs.predict_trial(config.of, start[0].settings, start[0].seed)
     place, candidates = opened(config), list[Candidate]()
     console.print(f"search      {goal.runs} candidates for the least {goal.least} over {', '.join(config.over)}", markup=False)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        tried = rig_search.search(goal, read, config.first_seed, attempt)
+        if goal.by == "prediction":
+            tried = rig_search.search_by_prediction(goal, read, foresee, attempt)
+        else:
+            tried = rig_search.search(goal, read, config.first_seed, attempt)
         candidates.extend(progress.track(tried, goal.runs, description="candidates"))
     found = rig_search.best(candidates)
+    if len(candidates) < goal.runs:
+        console.print(f"tried       {len(candidates)}; none of the others is predicted to be better", markup=False)
     for what, one in {"start": candidates[0] if goal.start else None, "best": found}.items():
         if one is not None:
             console.print(f"{what:12}{goal.least} {shown(one.value, '.4g')}: {', '.join(fields_of(one.point))}", markup=False)

@@ -35,8 +35,8 @@ def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
     return float(np.sqrt(2 / steps) * noise_dn / modulation_dn)
 
 
-def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
-    """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at a place : (3,) mm.
+def contrast(rig: Rig, fringes: Fringes, place: Array) -> Array:
+    """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at places : (..., 3) mm.
 
     The first harmonic of the waveform behind the projector's gamma, less what blurs it: the mirrors, `sinc(1 / pitch)`, and
     `transfer`.
@@ -44,7 +44,7 @@ def contrast(rig: Rig, fringes: Fringes, place: Array) -> float:
     turn, light = 2 * np.pi * np.arange(WAVE) / WAVE, waveform(rig, fringes, WAVE)
     first = 2 * np.mean(light * np.cos(turn))
     wave = np.array([1 / fringes.pitch])
-    return float(first / light.mean() * np.sinc(wave).item() * transfer(rig, place, wave).item())
+    return first / light.mean() * (np.sinc(wave) * transfer(rig, place, wave))[..., 0]
 
 
 def waveform(rig: Rig, fringes: Fringes, steps: int) -> Array:
@@ -55,23 +55,24 @@ def waveform(rig: Rig, fringes: Fringes, steps: int) -> Array:
     return black + (1 - black) * shown
 
 
-def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> float:
-    """RMS error of the phase, rad, that the projector's mirrors leave: replicas of the fringes at 1 -+ 1 / pitch cycles a px.
+def raster_sigma(rig: Rig, fringes: Fringes, place: Array) -> Array:
+    """RMS error of the phase, rad, at places : (..., 3) mm by the projector's mirrors.
 
-    Sampling makes them as strong as the fringes; a mirror's width, sinc(f), and all blur weaken them. Over a mirror's width both
-    turn once against the fringes, one forwards and one backwards, whatever the shift: no number of steps takes them out. As
-    sinc has other signs for them, their errors `sin(2 pi x)` add up.
+    Fringes on mirrors have replicas at 1 -+ 1 / pitch cycles a px. Sampling makes them as strong as the fringes; a mirror's
+    width, sinc(f), and all blur weaken them. Over a mirror's width both turn once against the fringes, one forwards and one
+    backwards, whatever the shift: no number of steps takes them out. As sinc has other signs for them, their errors
+    `sin(2 pi x)` add up.
     """
     wave = 1 / fringes.pitch
     waves = np.array([wave, 1 - wave, 1 + wave])
-    own, backwards, forwards = np.sinc(waves) * transfer(rig, place, waves)
-    return float(abs(backwards - forwards) / own / np.sqrt(2))
+    own, backwards, forwards = np.moveaxis(np.sinc(waves) * transfer(rig, place, waves), -1, 0)
+    return np.abs(backwards - forwards) / own / np.sqrt(2)
 
 
 def transfer(rig: Rig, place: Array, waves: Array) -> Array:
-    """Share : (n,) of the light's waves, cycles per projector px, that comes through both lenses and camera 1's pixels.
+    """Share : (..., n) of waves : (n,), cycles per projector px, that comes through both lenses and camera 1's pixels.
 
-    Of a surface at a place : (3,) mm that faces the devices. Point spreads are normal, what is out of focus is an even disc,
+    Of a surface at places : (..., 3) mm that faces the devices. Point spreads are normal, what is out of focus is an even disc,
     `2 J1(x) / x` with x = pi times its diameter in cycles, which is below zero beyond 1.22 cycles, and pixels are squares.
     """
     of_projector, disc, at = _lens_blur(rig.projector, place)
@@ -86,10 +87,10 @@ def _disc(cycles: Array) -> Array:
     return 2 * j1(x) / x
 
 
-def _lens_blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, float, float]:
-    """A lens's point spread (standard deviation) and disc of what is out of focus (diameter), own px, and px for a mm there."""
-    depth = float((device.optics.device_from_world.matrix() @ [*place, 1.0])[2])
-    disc = device.optics.focal_px[0] * device.lens.aperture_mm * abs(1 / depth - 1 / device.lens.focus_mm)
+def _lens_blur(device: CameraDevice | ProjectorDevice, place: Array) -> tuple[float, Array, Array]:
+    """A lens's point spread (standard deviation), own px, its disc (diameter) at places : (..., 3), and px for a mm."""
+    depth = rigid.apply(device.optics.device_from_world.matrix(), np.asarray(place, float))[..., 2:]
+    disc = device.optics.focal_px[0] * device.lens.aperture_mm * np.abs(1 / depth - 1 / device.lens.focus_mm)
     return device.lens.blur_px, disc, device.optics.focal_px[0] / depth
 
 

@@ -120,6 +120,7 @@ class Experiment:
     limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
     limit: str = "closed form"  # what these are
     counts: tuple[str, ...] = ()  # figures that a study adds up over its trials
+    predict: Callable[[Settings, int], Metrics] | None = None  # some of the figures by formulas, in milliseconds
 
 
 def experiment(name: str) -> Experiment:
@@ -191,9 +192,20 @@ def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, 
         As `same_code` does.
     """
     with same_code(key, digest(name, settings, seed)):
-        measure = experiment(name).measure
-        try:
-            return key, {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
-        except (ValueError, cv2.error) as error:  # InputError too
-            kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
-            return key, kind + " ".join(str(error).split())
+        return key, _figures(experiment(name).measure, settings, seed)
+
+
+def predict_trial(name: str, settings: Settings, seed: int) -> Metrics | str:
+    """What an experiment's formulas predict of a trial's figures, or in one line why they can't; InputError if it has none."""
+    predict = experiment(name).predict
+    if predict is None:
+        raise InputError(f"search: by: prediction needs an experiment with formulas, such as of=surface, found of={name}")
+    return _figures(predict, settings, seed)
+
+
+def _figures(measure: Callable[[Settings, int], Metrics], settings: Settings, seed: int) -> Metrics | str:
+    try:
+        return {figure: float(f"{value:.{DIGITS}g}") for figure, value in measure(settings, seed).items()}
+    except (ValueError, cv2.error) as error:  # InputError too
+        kind = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+        return kind + " ".join(str(error).split())

@@ -52,6 +52,7 @@ class Prediction(NamedTuple):
     mirrors_mm: float  # by the projector's raster alone
     modulation_dn: float  # median
     exposure_s: float
+    common_view: float  # of camera 1's pixels, on a plane that is larger than its view
 
 
 def predict(rig: Rig, measurement: Measurement) -> Prediction:
@@ -67,12 +68,12 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     points, slopes = _seen(rig, flat, measurement.plate)
     radiance = _radiance(rig, points, flat.normal, measurement.plate.reflectance)
     room = measurement.plate.reflectance * measurement.tracing.room_radiance * _passed(rig.cam1, points)
-    waves = np.array([_wave(rig, fringes, point) for point in points])  # (n, 3) mean, amplitude, peak of the light
+    mean, amplitude, peak = _wave(rig, fringes, points)
     if any(not isinstance(part, Fringes) for part in measurement.patterns.parts):
-        waves[:, 2] = 1.0  # a code's stripes, or a uniform image
+        peak = np.ones_like(mean)  # a code's stripes, or a uniform image
     electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
     shooting, sensor = measurement.shooting, rig.cam1.sensor
-    brightest = float(np.percentile(radiance * waves[:, 2] + room, BRIGHTEST)) * electron  # a second
+    brightest = float(np.percentile(radiance * peak + room, BRIGHTEST)) * electron  # a second
     longest_s = sensor.saturation_e / (brightest * shooting.gain)
     time_s = shooting.exposure_s or shooting.level * longest_s
     if time_s > longest_s:
@@ -80,14 +81,15 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
         raise ValueError(f"shooting.exposure_s: {expected}, found {1e3 * time_s:.3g} ms")
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
     per_electron = number_per_electron(sensor, exposure)
-    mean_e = (radiance * waves[:, 0] + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
-    modulation = radiance * waves[:, 1] * electron * time_s * per_electron
+    mean_e = (radiance * mean + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
+    modulation = radiance * amplitude * electron * time_s * per_electron
     noise = noise_dn(np.float32(mean_e), sensor, exposure)
     by_noise = np.sqrt(2 / fringes.steps) * noise / modulation
-    by_mirrors = np.array([closed_forms.raster_sigma(rig, fringes, point) for point in points])
+    by_mirrors = closed_forms.raster_sigma(rig, fringes, points)
     mm_a_rad = fringes.pitch / (2 * np.pi) * slopes
     noise_mm, mirrors_mm = (float(np.sqrt(np.mean((mm_a_rad * error) ** 2))) for error in (by_noise, by_mirrors))
-    return Prediction(float(np.hypot(noise_mm, mirrors_mm)), noise_mm, mirrors_mm, float(np.median(modulation)), float(time_s))
+    view = len(points) / (GRID[0] * GRID[1])
+    return Prediction(float(np.hypot(noise_mm, mirrors_mm)), noise_mm, mirrors_mm, float(np.median(modulation)), time_s, view)
 
 
 def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:
@@ -131,13 +133,13 @@ def _corner2(device: CameraDevice | ProjectorDevice, points: Array) -> Array:
     return ((camera.project(points) - middle) ** 2).sum(axis=1) / (middle @ middle)
 
 
-def _wave(rig: Rig, fringes: Fringes, place: Array) -> tuple[float, float, float]:
-    """Mean, first harmonic's amplitude and peak of the fringes' light at a place with all blur, 1 for a pixel fully on."""
+def _wave(rig: Rig, fringes: Fringes, points: Array) -> tuple[Array, Array, Array]:
+    """Mean, first harmonic's amplitude and peak : (n,) of the fringes' light at points with all blur, 1 for a pixel fully on."""
     harmonics = np.fft.rfft(closed_forms.waveform(rig, fringes, WAVE)) / WAVE
     waves = np.arange(len(harmonics)) / fringes.pitch
-    harmonics = harmonics * np.sinc(waves) * closed_forms.transfer(rig, place, waves)
-    peak = float(np.fft.irfft(harmonics * WAVE).max())
-    return float(harmonics[0].real), float(2 * np.abs(harmonics[1])), peak
+    blurred = harmonics * np.sinc(waves) * closed_forms.transfer(rig, points, waves)
+    peak = np.fft.irfft(blurred * WAVE, axis=-1).max(axis=-1)
+    return blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), peak
 
 
 def uncertainty(rig: Rig, measurement: Measurement) -> float:

@@ -7,9 +7,10 @@ from recon.geometry.primitives import Plane
 from recon.model.rig import Rig
 from scenes.kinds import plane
 from twin.conditions import drifted
-from twin.experiments import closed_forms, surface_accuracy
+from twin.experiments import closed_forms, predicted_plane, surface_accuracy
 from twin.experiments.experiment_runs import Experiment, Settings
 from twin.experiments.layout import laid_out
+from twin.experiments.predicted_plane import Measurement
 from twin.experiments.surface_accuracy import Experiment as Surface
 from twin.sensor import Exposure, electrons_per_radiance, number_per_electron
 from twin.working_range import working_range
@@ -17,10 +18,7 @@ from twin.working_range import working_range
 
 def measure(settings: Settings, seed: int) -> Metrics:
     """Figures of a plane, tilted as one of the paper's, in turn by the seed."""
-    rig = drifted(laid_out(settings.rig, settings.layout), settings.conditions.drift, seed)
-    pose = working_range(settings.rig).plate(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
-    if settings.plane.depth_mm is not None:
-        pose = pose.model_copy(update={"centre_mm": (*pose.centre_mm[:2], settings.plane.depth_mm)})
+    rig, pose = drifted(laid_out(settings.rig, settings.layout), settings.conditions.drift, seed), plate_of(settings, seed)
     result = surface_accuracy.experiment(
         rig, plane.build(pose), settings.patterns, seed, settings.tracing, settings.shooting, settings.conditions
     )
@@ -44,6 +42,28 @@ def measure(settings: Settings, seed: int) -> Metrics:
     }
 
 
+def plate_of(settings: Settings, seed: int) -> plane.Config:
+    """The plane that a trial measures."""
+    pose = working_range(settings.rig).plate(plane.PAPER_POSES[seed % len(plane.PAPER_POSES)])
+    if settings.plane.depth_mm is None:
+        return pose
+    return pose.model_copy(update={"centre_mm": (*pose.centre_mm[:2], settings.plane.depth_mm)})
+
+
+def predict(settings: Settings, seed: int) -> Metrics:
+    """Those figures of the same plane that formulas give; errors of frames and drift aren't in them."""
+    rig, patterns = laid_out(settings.rig, settings.layout), settings.patterns
+    found = predicted_plane.predict(rig, Measurement(patterns, plate_of(settings, seed), settings.shooting, settings.tracing))
+    return {
+        "plane_rms_mm": found.rms_mm,
+        "common_view": found.common_view,
+        "modulation_dn": found.modulation_dn,
+        "images": patterns.count,
+        "exposure_s": found.exposure_s,
+        "images_s": patterns.count * found.exposure_s,
+    }
+
+
 def room_brightness(rig: Rig, settings: Settings, reflectance: float, exposure: Exposure) -> float:
     """Brightness, DN, that the room's light alone gives a matt surface in camera 1: radiance `reflectance * room`."""
     electrons = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm) * exposure.time_s
@@ -61,4 +81,4 @@ def closed_form(rig: Rig, settings: Settings, result: Surface, brightness_dn: fl
 
 
 READS = ("rig", "layout.projector_mm", "patterns", "plane", "conditions.frames", "conditions.drift", "tracing", "shooting")
-EXPERIMENT = Experiment(READS, measure, {"plane_rms_mm": "plane_limit_mm"})
+EXPERIMENT = Experiment(READS, measure, {"plane_rms_mm": "plane_limit_mm"}, predict=predict)

@@ -1,5 +1,6 @@
-"""Search for the settings that make a figure least, under bounds of other figures and of the price, by Optuna.
+"""Search for the settings that make a figure least, under bounds of other figures and of the price.
 
+By Optuna, or in the order of what formulas predict, which needs a fraction of the trials where an experiment has such formulas.
 Candidates come in batches of a fixed size and are told of in order, so a search is the same whatever the engine; one that was
 stopped goes on by its kept trials.
 """
@@ -17,10 +18,12 @@ from pydantic import Field
 
 from recon.errors import InputError
 from recon.model.rig import Part
-from twin.studies.factors import Choices, Factor, Normal, Point, Range
+from twin.studies.factors import Choices, Factor, Normal, Point, Range, factorial, filling
 from twin.studies.study_runs import Done, numeric
 
 PRICE = "price"
+DRAWN = 4096  # points that are drawn from ranges, to be predicted
+CLOSE = 0.05  # relative error of a prediction, by which a bound may be missed that a trial would keep
 
 
 class Bound(Part):
@@ -44,7 +47,8 @@ class Goal(Part):
     least: str  # figure to be least: its mean over seeds, in the worst of `each`
     runs: Annotated[int, Field(ge=1, le=100_000)] = 24  # candidates
     batch: Annotated[int, Field(ge=1, le=1000)] = 4  # that are chosen at once, and can be tried at the same time
-    by: Literal["gp", "tpe"] = "gp"  # Gaussian process, which needs PyTorch, or Parzen estimators, which need thrice the runs
+    by: Literal["gp", "tpe", "prediction"] = "gp"  # Gaussian process, which needs PyTorch; Parzen estimators, which need thrice
+    # the runs; or formulas of the experiment, best first, until none that is left is predicted to be better
     start: Point = Field(default_factory=dict)  # the first candidate: the rig as it is; a value for each field of over, or none
     each: dict[str, list[Any]] = Field(default_factory=dict)  # fields and values that a candidate is tried under, such as depths
     bounds: dict[str, Bound] = Field(default_factory=dict)  # of figures, and of `price`
@@ -139,6 +143,45 @@ def search(
             else:
                 study.tell(trial, state=optuna.trial.TrialState.FAIL)
             yield candidate
+
+
+def search_by_prediction(
+    goal: Goal,
+    factors: Mapping[str, Factor],
+    foresee: Callable[[Sequence[Point]], Sequence[Sequence[Done]]],
+    attempt: Callable[[Sequence[Point]], Sequence[Sequence[Done]]],
+) -> Iterator[Candidate]:
+    """Try candidates in the order of what is predicted for them, until none that is left is predicted to be better.
+
+    What is found is compared with what was predicted: none is left when even the least ratio so far doesn't make the next
+    candidate better than the best one. Bounds of figures that aren't predicted count once these are found.
+
+    Parameters
+    ----------
+    foresee : predicts the trials of some points, and gives them point by point
+    attempt : does them
+    """
+    listed = all(isinstance(factor, Choices) for factor in factors.values())
+    points = factorial(factors) if listed else filling(factors, DRAWN, "sobol")
+    predicted = dict(enumerate(foresee(points)))
+    figures = {name for done in predicted.values() for one in done for name in one.figures} | {PRICE}
+    known = goal.model_copy(update={"bounds": {name: bound for name, bound in goal.bounds.items() if name in figures}})
+    judgements = [judged(known, factors, point, predicted[number]) for number, point in enumerate(points)]
+    likely = sorted((one for one in judgements if one.excess <= CLOSE and math.isfinite(one.value)), key=lambda one: one.value)
+    if goal.start:
+        likely = [one for one in likely if one.point != goal.start]
+        likely.insert(0, judged(known, factors, goal.start, foresee([goal.start])[0]))
+    tried, ratios = list[Candidate](), list[float]()
+    for first in range(0, min(len(likely), goal.runs), goal.batch):
+        batch = likely[first : min(first + goal.batch, goal.runs)]
+        found = best(tried)
+        if found is not None and min(ratios) * min(one.value for one in batch) > found.value:
+            return
+        for one, done in zip(batch, attempt([one.point for one in batch]), strict=True):
+            tried.append(judged(goal, factors, one.point, done))
+            if math.isfinite(tried[-1].value / one.value):
+                ratios.append(tried[-1].value / one.value)
+            yield tried[-1]
 
 
 def _sampler(goal: Goal, seed: int) -> optuna.samplers.BaseSampler:

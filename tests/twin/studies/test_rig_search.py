@@ -247,3 +247,26 @@ def test_a_gaussian_process_without_torch_is_refused(monkeypatch):
     with pytest.raises(InputError, match="search: by: gp needs PyTorch"):
         rig_search.check(GOAL.model_copy(update={"by": "gp"}), OVER)
     rig_search.check(GOAL, OVER)
+
+
+def test_predictions_lead_to_the_best_in_a_fraction_of_the_trials():
+    """Of formulas that are off by up to a twentieth, and know nothing of the overlap: it ends once none left can be better."""
+    rng = np.random.default_rng(5)
+    off = {str(point): 1.1 * (1 + 0.05 * rng.uniform(-1, 1)) for point in factors.factorial(OVER)}
+
+    def foresee(points):
+        return [[done(at, {"error": off[str(at)] * (f := figures(at))["error"], "time": f["time"]})] for at in points]
+
+    goal = GOAL.model_copy(update={"runs": 100, "by": "prediction"})
+    tried = list(rig_search.search_by_prediction(goal, OVER, foresee, attempt))
+    assert len(tried) < len(factors.factorial(OVER)) / 10 and tried[0].point == START
+    assert rig_search.best(tried).value == pytest.approx(grid()[0]["error"], rel=0.01)
+    rest = [one for one in foresee(factors.factorial(OVER)) if one[0].trial.point not in [each.point for each in tried]]
+    able = [figures(one[0].trial.point) for one in rest if one[0].figures["time"] <= 0.08]
+    assert min(one["error"] for one in able if one["overlap"] >= 0.5) >= rig_search.best(tried).value * 0.99
+
+
+def test_predictions_that_are_all_out_of_bounds_leave_the_start():
+    goal = GOAL.model_copy(update={"bounds": {"time": Bound(most=1e-6)}, "by": "prediction"})
+    foresee = attempt
+    assert [one.point for one in rig_search.search_by_prediction(goal, OVER, foresee, attempt)] == [START]
