@@ -1,4 +1,4 @@
-"""Predict what error a rig will find on a plane, before anything is recorded, and what would lower it.
+"""Predict what errors a rig will find, before anything is recorded, and what would lower that of a plane.
 
 Reads a rig, such as that of `sonotwin identify`, with patterns, a plate and settings of light and exposure; renders nothing. Says
 the RMS distance of points from their plane, with the interval that the rig's measured numbers leave, and how it changes with each
@@ -6,28 +6,36 @@ of the rig's numbers by which it does: -1 is an error that halves when the numbe
 fields, each with its price: they are tried one by one, the most error saved for the money first. Takes some seconds.
 
 The noise of camera 1 and the projector's raster are in it; errors of the calibration, flicker, and light that spreads in skin
-aren't.
+aren't. With `sessions` whole ones are drawn, from the board to a mass, with the errors of `conditions`: what detectors would
+find is drawn, and the real software does the rest. They say the errors of points, pixels of B-scans and masses' centres.
 
     sonotwin predict
     sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700]
+    sonotwin predict conditions=lifelike sessions=24
     sonotwin predict "changes={rig.projector.radiant_flux_w: {to: 1.2, price: 800}, patterns.parts.1.steps: {to: 16, price: 0}}"
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import AfterValidator, Field, ValidationError
 
 from recon.errors import InputError, one_line
 from recon.model.part import Finite, NotNegative, Part
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
+from scenes.board_poses import Config as BoardPoses
 from scenes.kinds import plane
+from sonotwin.config import defaults
 from sonotwin.console_watch import LineConsole
-from twin.experiments import predicted_plane
+from sonotwin.experiment_settings import settings_of
+from twin.conditions import IDEAL, Conditions
+from twin.experiments import predicted_plane, predicted_session
+from twin.experiments.experiment_runs import Settings
 from twin.experiments.predicted_plane import Measurement
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
+from twin.ultrasound.transducer import Transducer
 
 TOLD = 0.02  # relative change of the error by that of a number: less isn't told
 NUMBERS = (
@@ -45,6 +53,12 @@ class Change(Part):
     price: NotNegative = 0.0
 
 
+def _two_or_none(sessions: int) -> int:
+    if sessions == 1:
+        raise ValueError("expected 0 or at least 2, which show how sessions differ, found 1")
+    return sessions
+
+
 class Config(Part):
     """Fields of `conf/predict.yaml`."""
 
@@ -53,6 +67,10 @@ class Config(Part):
     tracing: Tracing
     plate: plane.Config = plane.Config()
     shooting: Shooting = Shooting()
+    conditions: Conditions = IDEAL
+    poses: BoardPoses = BoardPoses()
+    ultrasound: Transducer = Transducer()
+    sessions: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_two_or_none)] = 0
     changes: dict[str, Change] = Field(default_factory=dict)
 
 
@@ -77,6 +95,10 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
     yield f"predicted   plane {found.rms_mm:.4f} mm RMS, {known if rig.measured else unknown}"
     parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm"
     yield f"by          {parts}; modulation {found.modulation_dn:.0f} DN, exposure {1e3 * found.exposure_s:.2f} ms"
+    if config.sessions:
+        for figure, one in predicted_session.predict(_session(config), range(config.sessions)).items():
+            of = f"of {config.sessions} drawn sessions, {one.worst:.2g} mm in the worst"
+            yield f"predicted   {predicted_session.FIGURES[figure]} {one.rms:.3f} ± {1.96 * one.sigma:.2g} mm RMS (95 %) {of}"
     for name, slope in predicted_plane.elasticities(rig, measurement_of(config), NUMBERS).items():
         if abs(slope) >= TOLD:
             yield f"depends     {name} {rig.number(name):g}: {slope:+.2f} % a per cent"
@@ -91,6 +113,12 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
 def measurement_of(config: Config) -> Measurement:
     """What is to be measured."""
     return Measurement(config.patterns, config.plate, config.shooting, config.tracing)
+
+
+def _session(config: Config) -> Settings:
+    """The same rig in a whole session; all else as in `conf/study.yaml`."""
+    names = ("rig", "conditions", "poses", "ultrasound", "patterns", "shooting", "tracing")
+    return Settings.model_validate(settings_of(defaults("study") | {name: getattr(config, name) for name in names}))
 
 
 def _worth(saved_mm: float, change: Change) -> float:

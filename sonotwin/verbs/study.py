@@ -10,18 +10,16 @@ that was stopped, or has more values or seeds. A trial takes from a second (chai
     sonotwin study name=budget out=outputs/budget engine.workers=2
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import yaml
-from pydantic import Field, ValidationError, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from recon.model.patterns import Patterns
-from recon.model.rig import Part, Rig
+from recon.model.rig import Part
 from sonotwin import study_steps
-from sonotwin.config import compose, defaults, folder
+from sonotwin.config import compose, defaults
 from sonotwin.console_watch import LineConsole
+from sonotwin.experiment_settings import settings_of
 from sonotwin.study_plan import SWEEP, Points, Seeds, read_study
 from twin.engine import Engine
 from twin.experiments.experiment_runs import MODULES, Settings
@@ -64,9 +62,6 @@ class Config(Part):
         if study is not None and study.fields and overrides:
             given = compose("study", [*study.fields, *overrides])
         own = {} if study is None else study.model_dump(exclude={"fields"})
-        ranges = yaml.safe_load((folder() / "dataset.yaml").read_text(encoding="utf-8"))["ranges"]
-        settings = {name: value for name, value in given.items() if name in Settings.model_fields} | {"ranges": ranges}
-        settings |= _on_raster(settings)
         fields = {name: value for name, value in given.items() if name not in Settings.model_fields and value is not None}
         for name in ("search", "budget"):
             if own.get(name) and isinstance(fields.get(name), dict):
@@ -74,7 +69,7 @@ class Config(Part):
         for name in ("of", "over"):
             if name not in own | fields:
                 raise ValueError(f"{name}: needs a value with name={SWEEP}; give {name}=...")
-        return {**own, **fields, "given": overrides, "settings": settings}
+        return {**own, **fields, "given": overrides, "settings": settings_of(given)}
 
     @model_validator(mode="after")
     def _known(self) -> "Config":
@@ -85,16 +80,6 @@ class Config(Part):
                 "over: expected a field with its values, as in over='{shooting.exposure_s: [0.004, 0.008]}', found none"
             )
         return self
-
-
-def _on_raster(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Pattern sequences on the raster of the rig's projector; those that are wrong are left for their own complaint."""
-    try:
-        size = Rig.model_validate(settings.get("rig")).projector.optics.size
-        named = {name: Patterns.model_validate(settings.get(name)) for name in ("patterns", "board_patterns")}
-        return {name: patterns.on(size) for name, patterns in named.items()}
-    except ValidationError:
-        return {}
 
 
 def of_conf(name: str, out: Path, **fields: Any) -> Config:

@@ -25,11 +25,19 @@ def test_measured_numbers_give_an_interval(tmp_path, capsys):
     assert "mm (95 %, by 1 measured numbers, if all others" in capsys.readouterr().out
 
 
+def test_sessions_tell_errors_of_points_b_scans_and_masses(capsys):
+    assert main(["predict", "conditions=lifelike", "poses=demo", "sessions=2"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    (line,) = (line for line in said if "the centre of a mass against the skin" in line)
+    assert " mm RMS (95 %) of 2 drawn sessions, " in line and sum(line.startswith("predicted") for line in said) == 5
+
+
 def test_what_can_not_be_changed_is_refused_by_name(capsys):
     for given, told in (
         ("changes={rig.projectr.gamma: {to: 1}}", "rig.projectr.gamma"),
         ("changes={rig.projector.gamma: {to: -1}}", "rig.projector.gamma"),
         ("changes={rig.projector.gamma: {price: 1}}", "to"),
+        ("sessions=1", "sessions: expected 0 or at least 2"),
         ("shooting.exposure_s=0.2", "bright places saturate"),
         ("plate.centre_mm=[3000,0,660]", "in view of camera 1 and the projector"),
     ):
