@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
 from recon.capture.board_part import BoardCapture
 from recon.capture.images import image_files, read_images
-from recon.capture.manifest import Device, Manifest, PartName, read_manifest
+from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic
@@ -72,7 +73,9 @@ class Settings(Part):
     capture: Path
     """a capture folder with a board, a surface under fringes, or both"""
     rig: Annotated[Rig, Choice("meza2021")]
-    """to begin with: what isn't measured stays as it has it, such as the pixels' size"""
+    """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
+    day: date | None = None
+    """of the capture, such as 2026-11-30; null: that of its manifest.json, in UTC"""
     calibration: Path | None = None
     """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
     dark: Path | None = None
@@ -100,9 +103,11 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     rig, found = identify(settings, watch)
     for line in describe(found):
         watch.say(line)
+    name = read_manifest(settings.capture).name or settings.capture.resolve().name
+    rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
         (
-            f"A rig as identified from {settings.capture.resolve().name}: numbers with an uncertainty (1 sigma) were measured,",
+            f"A rig as identified from {name}: numbers with an uncertainty (1 sigma) were measured,",
             "others are as in the rig that it began with, or in its calibration. `sonotwin VERB rig=FILE` takes it.",
         )
     )
@@ -111,7 +116,11 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         (new / CONDITIONS).write_text(conditions_text(found), encoding="utf-8")
         content = json.dumps(asdict(found), indent=2, ensure_ascii=False, allow_nan=False)
         (new / FIGURES).write_text(content + "\n", encoding="utf-8")
-    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}")
+    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}, version {rig.version} of the rig")
+
+
+def _day(path: Path) -> date:
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date()
 
 
 @linear_algebra.on_one_thread()
