@@ -79,7 +79,8 @@ class Settings(Part):
     calibration: Path | None = None
     """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
     dark: Path | None = None
-    """folder of images with covered lenses, in cam1/ and cam2/, exposed as the capture's: black level, dark noise, DSNU"""
+    """folder of images with covered lenses, in cam1/ and cam2/, exposed as the capture's: black level, dark noise, DSNU; null:
+    dark/ in the capture, if it is there; likewise flat/ and room/"""
     flat: Path | None = None
     """the same of an even light, at one level, or at several in a folder each, such as cam1/half/: gain, PRNU"""
     room: Path | None = None
@@ -126,7 +127,7 @@ def _day(path: Path) -> date:
 @linear_algebra.on_one_thread()
 def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
     """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
-    manifest = read_manifest(settings.capture)
+    manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
     if manifest.board is None and manifest.surface is None:
         raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
     part: PartName = "board" if manifest.surface is None else "surface"
@@ -160,6 +161,12 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
     return rig_file.apply(rig, found), found
+
+
+def _with_own_frames(settings: Settings) -> Settings:
+    """Settings with the capture's own folders of further images, where no others are given."""
+    own = {name: settings.capture / name for name in ("dark", "flat", "room") if getattr(settings, name) is None}
+    return settings.model_copy(update={name: folder for name, folder in own.items() if folder.is_dir()})
 
 
 @dataclass(frozen=True)
