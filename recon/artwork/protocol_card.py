@@ -6,7 +6,6 @@ The table of docs/identify.md is made of the same steps.
 from pathlib import Path
 from typing import NamedTuple
 
-from reportlab.graphics.shapes import Drawing, Rect
 from reportlab.lib.colors import HexColor
 from reportlab.lib.styles import ParagraphStyle
 from reportlab.platypus import Flowable, Paragraph, SimpleDocTemplate, Spacer, Table
@@ -48,8 +47,8 @@ STEPS = (
         "Surface",
         "a matt, light surface as deep as the working range, under 8 steps or more and Gray code",
         "gamma, blur and focus of the projector; flicker, stray light, errors of the shifts",
-        "Plaster, or a ball of 10 cm. Note the exposure below, which the program sets: it is that of steps 3 and 4, too.",
-        ("it says kept", "fringes of 50 DN or more, under 1 % saturated"),
+        "Plaster, or a ball of 10 cm. The program sets the exposure, that of steps 3 and 4, too.",
+        ("it says kept", "fringes of 50 DN or more, hardly any saturated"),
         "sonotwin record part=surface patterns=gray_surface out=session",
         True,
     ),
@@ -59,36 +58,36 @@ STEPS = (
         "the same with the projector covered, 2 images or more of each camera",
         "contrast: the projector's black apart from the room's light",
         "Hold black card before the projector's lens. Move nothing else.",
-        ("the surface is dark, but not blacker than in step 4",),
-        "session/room/cam1, session/room/cam2",
-        False,
+        ("it says kept", "the surface is dark, but not blacker than in step 4"),
+        "sonotwin record part=room out=session",
+        True,
     ),
     Step(
         1,
         "Dark",
         "16 images with the lens caps on, at the exposure of the fringes",
         "black level, dark noise, DSNU",
-        "Caps on both cameras, a black cloth over them.",
-        ("all is black: 10 of 255 or less", "no brighter edge where light creeps in"),
-        "session/dark/cam1, session/dark/cam2",
-        False,
+        "Best with a black cloth over the caps.",
+        ("it says kept", "all is black, without a brighter edge"),
+        "sonotwin record part=dark out=session",
+        True,
     ),
     Step(
         2,
         "Flat",
-        "16 images of a white board out of focus at half the brightness, 16 at full, projector on",
+        "16 images of white paper out of focus at half the brightness, 16 at full, projector on",
         "electrons a digital number, PRNU",
-        "White paper a hand's breadth before the lens; turn it for less light.",
-        ("half: 90 to 130 of 255, full: 170 to 220", "corners have half of the middle or more, no pixel has 255"),
-        "session/flat/cam1/half, .../cam1/full, and so of cam2",
-        False,
+        "Matt, a hand's breadth before each lens, square to it. The program sets the exposures.",
+        ("it says kept", "corners have half of the middle's light or more"),
+        "sonotwin record part=flat out=session",
+        True,
     ),
     Step(
         4,
         "Ultrasound",
         "B-scans of even tissue, each elsewhere; the probe in air; steps of 0.2 mm",
         "the scanner: `recon.identification.scanner`, in Python",
-        "Depth, gain and focus as in use. Gel on a phantom without cysts; then the probe in air; then a micrometer's steps.",
+        "Depth, gain and focus as in use; gel on a phantom without cysts; a micrometer moves the probe.",
         ("20 B-scans or more of speckle alone", "nothing is white all over"),
         "session/us, any format of docs/freehand.md",
         False,
@@ -101,6 +100,22 @@ BEFORE = (
     "Automatic exposure, gain and gamma are off.",
 )
 AFTER = "sonotwin identify rig=our_rig.yaml capture=session out=identified"
+
+
+class _Box(Flowable):
+    """A box to be ticked."""
+
+    SIDE = 7.5
+
+    def wrap(self, aW: float, aH: float) -> tuple[float, float]:
+        """Width and height, whatever room there is."""
+        return self.SIDE, self.SIDE
+
+    def draw(self) -> None:
+        """Draw its outline."""
+        self.canv.setStrokeColor(INK)
+        self.canv.setLineWidth(0.7)
+        self.canv.rect(0, 0, self.SIDE, self.SIDE)
 
 
 def write(path: Path, paper: Size, margin_mm: float) -> int:
@@ -134,15 +149,13 @@ def _content(width: float) -> list[Flowable]:
     title = ParagraphStyle("title", plain, fontName=BOLD, fontSize=20, leading=25)
     head = ParagraphStyle("head", plain, fontName=BOLD, fontSize=12, leading=15)
     number = ParagraphStyle("number", head, fontSize=22, leading=24, textColor=ACCENT)
-    box = Drawing(14, 8)
-    box.add(Rect(0, 0, 7.5, 7.5, fillColor=None, strokeColor=INK, strokeWidth=0.7))
     beside, gap = 0.3 * width, 4.0
     middle = width - MINUTES_WIDTH - beside
     tight = [("VALIGN", (0, 0), (-1, -1), "TOP"), ("TOPPADDING", (0, 0), (-1, -1), 0), ("BOTTOMPADDING", (0, 0), (-1, -1), 1)]
     tight += [("LEFTPADDING", (0, 0), (-1, -1), 0), ("RIGHTPADDING", (0, 0), (-1, -1), 0)]
 
     def ticks(lines: tuple[str, ...], across: float) -> Table:
-        return Table([[box, Paragraph(one, plain)] for one in lines], [14, across - 14], style=tight)
+        return Table([[_Box(), Paragraph(one, plain)] for one in lines], [14, across - 14], style=tight)
 
     rows = [
         [

@@ -89,8 +89,11 @@ def test_what_is_no_capture_of_these_is_refused(capture, frames, tmp_path, capsy
     other.mkdir(parents=True)
     for name in "ab":
         cv2.imwrite(str(other / f"{name}.png"), np.zeros((8, 9), np.uint8))
+    own = shutil.copytree(capture, tmp_path / "own")
+    (own / "dark").mkdir()
     for given, told in (
         ([f"capture={tmp_path}"], "manifest.json"),
+        ([f"capture={own}"], "own/dark: expected a folder with images in cam1, found none"),
         ([f"capture={capture}", f"dark={few.parent}"], "expected two images or more of one thing, found 1"),
         ([f"capture={capture}", f"dark={other.parent}"], "expected 320x256"),
         ([f"capture={capture}", f"flat={tmp_path / 'nothing'}"], "expected a folder with images in cam1, found nothing"),
