@@ -188,7 +188,8 @@ def _row(one: Entry) -> tuple[str, ...]:
 
 
 def _figures(made: Check) -> list[tuple[str, str, str]]:
-    worst = max((one.sigma for one in made.parts if one.sigma is not None), default=0.0)
+    numbers = () if made.rig is None else made.rig.numbers
+    worst = max((one.sigma for one in (*made.parts, *numbers) if one.sigma is not None), default=0.0)
     moved = sum(one.state == "moved" for one in made.parts)
     checked = sum(one.state != "unseen" for one in made.parts)
     figures = [("parts checked", str(checked), ""), ("moved", str(moved), ""), ("largest deviation", f"{worst:.1f}", "σ")]
