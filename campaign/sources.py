@@ -146,6 +146,8 @@ COMMANDS = (
             ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
     Command("check", ("capture=bottom/capture", "probe=probe/probe.yaml", "lag=lag/lag.json", "log=rig.jsonl"),
             ("bottom", "probe", "lag", "rig.jsonl"), (*_sweep("bottom"), "probe/probe.yaml", "lag/lag.json", "rig.jsonl")),
+    Command("check", ("today=today", "rig.measured={projector.gamma: {sigma: 0.01, source: sheet}}"), ("today",),
+            ("today/rig.yaml",)),
     Command("navigate", ("capture=filmed/capture", "skin=bent.ply", "masses=lump", "seconds=1", "view.port=0",
                          "igtl.serve=false"),
             ("filmed", "bent.ply", "lump"), (*PLAYED, "bent.ply", "lump/mass0.ply"), out=""),
@@ -264,6 +266,7 @@ def _write_others(folder: Path) -> None:
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     _write_tool(folder)
+    _write_rig(folder / "today")
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
 
 
@@ -350,6 +353,19 @@ def _write_tool(folder: Path) -> None:
     drawn = np.array([12.0, -111.463, -155.128])  # of `scenes.handheld.looks.needle`, in its target's frame
     tip_files.write(folder / "needle_tip.yaml", Tip(drawn, np.eye(3), body="needle"))
     tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis, body="needle"))
+
+
+def _write_rig(folder: Path) -> None:
+    """A rig's file, as identified."""
+    from datetime import date
+
+    from recon.identification import rig_file
+    from recon.identification.estimates import Estimate, Findings
+    from sonotwin.choices import read_rig
+
+    found = rig_file.apply(read_rig(), Findings({"projector.gamma": Estimate(2.21, 0.01, "made up")}))
+    folder.mkdir(exist_ok=True)
+    rig_file.write(folder / "rig.yaml", rig_file.next_version(found, "made up", date(2026, 5, 4)), {}, "made up")
 
 
 def _pairs(folder: Path, noise_px: float = 0.0) -> str:

@@ -95,6 +95,15 @@ class Recording:
         finally:
             self._tidy_surface()
 
+    def add_frames(self, name: str, images: Mapping[str, Images]) -> None:
+        """Add images of no part, such as of covered lenses, or put them in the place of earlier ones.
+
+        images : folder below one of that name -> (n, h, w)
+        """
+        with atomic.new_folder(self.folder / name, RECORD) as temporary:
+            for place, stack in images.items():
+                write_images([temporary / place / image_name(k) for k in range(len(stack))], stack)
+
     def add_pose(
         self,
         lit: Mapping[str, Images],

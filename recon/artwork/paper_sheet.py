@@ -107,6 +107,11 @@ def write(path: Path, pages: Sequence[Page], margin_mm: float, title: str) -> No
         _write_lines(canvas, lines, (left, margin_mm + BELOW_MM - 3.5), sheet.paper[0] - margin_mm - left)
         canvas.showPage()
     canvas.save()
+    mark(path)
+
+
+def mark(path: Path) -> None:
+    """Mark a PDF as it was written."""
     content = path.read_bytes()
     path.write_bytes(content + _mark_of(content))
 

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.identification.estimates import Estimate, Findings
-from recon.model.calibration import WORLD, Calibration
-from recon.model.rig import Optics, Pose, Rig
+from recon.model.calibration import WORLD, Calibration, with_scale
+from recon.model.rig import DEVICES, Optics, OpticsCovariance, Pose, Rig
 
 SOURCE = "calibration by a board"
 
@@ -15,11 +15,11 @@ SOURCE = "calibration by a board"
 def with_devices(rig: Rig, calibration: Calibration) -> Rig:
     """The rig with its devices' optics as calibrated; cameras' nominal focal lengths follow by their pixels' size.
 
-    What was measured of these optics before doesn't count any more.
+    What was measured of these optics before doesn't count any more, nor does the covariance of all.
     """
     changed = {}
     for name, camera in calibration.cameras.items():
-        if name not in ("cam1", "cam2", "projector"):
+        if name not in DEVICES:
             continue
         device = getattr(rig, name)
         update: dict[str, object] = {"optics": optics_of(camera)}
@@ -29,7 +29,20 @@ def with_devices(rig: Rig, calibration: Calibration) -> Rig:
         changed[name] = device.model_copy(update=update)
     replaced = tuple(f"{name}.optics." for name in changed)
     kept = {name: one for name, one in rig.measured.items() if not name.startswith(replaced)}
-    return rig.model_copy(update=changed | {"measured": kept})
+    return rig.model_copy(update=changed | {"measured": kept, "optics_covariance": _covariance(calibration)})
+
+
+def _covariance(calibration: Calibration) -> OpticsCovariance | None:
+    """Covariance as the rig's description has it, the scale's error included."""
+    if calibration.uncertainty is None:
+        return None
+    known = with_scale(calibration.uncertainty, calibration.cameras, None)
+    assert known is not None
+    places = [k for k, name in enumerate(known.names) if name.partition(".")[0] in DEVICES]
+    rows = known.covariance[np.ix_(places, places)].tolist()
+    return OpticsCovariance(
+        names=tuple(known.names[k] for k in places), rows=tuple(tuple(row[: k + 1]) for k, row in enumerate(rows))
+    )
 
 
 def optics_of(camera: Camera) -> Optics:

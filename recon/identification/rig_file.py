@@ -5,6 +5,7 @@ Each line of it says how well its number is known and from what, or why it isn't
 
 import math
 from collections.abc import Iterator, Mapping
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from recon.errors import InputError, one_line
 from recon.files import atomic
 from recon.identification.estimates import Findings
-from recon.model.rig import Measured, Rig
+from recon.model.rig import Identified, Measured, Rig
 
 DIGITS = 2  # of a standard deviation, to which a value is written
 
@@ -43,6 +44,11 @@ def apply(rig: Rig, findings: Findings) -> Rig:
         return Rig.model_validate(content)
     except ValidationError as error:
         raise InputError(f"rig: as measured, it can't be: {one_line(error)}") from error
+
+
+def next_version(rig: Rig, capture: str, day: date) -> Rig:
+    """The rig as identified from a capture of a name and a day: one version on from that with which identification began."""
+    return rig.model_copy(update={"version": rig.version + 1, "identified": Identified(day=day, capture=capture)})
 
 
 def _put(content: Any, name: str, value: float) -> None:
@@ -75,10 +81,17 @@ def _lines(content: Mapping[str, Any], above: str, measured: Mapping[str, Measur
         if isinstance(value, Mapping) and value:
             yield f"{indent}{key}:"
             yield from _lines(value, f"{name}.", measured, unknown) if name != "measured" else _measures(value)
+        elif isinstance(value, list) and value and isinstance(value[0], list):
+            yield f"{indent}{key}:"
+            yield from (f"{indent}- {_text(_rounded(name, row, measured))}" for row in value)
         else:
             remark = _remark(name, value, measured, unknown)
-            text = yaml.safe_dump(_rounded(name, value, measured), default_flow_style=True, width=10_000).removesuffix("\n...\n")
-            yield f"{indent}{key}: {text.strip()}" + (f"  # {remark}" if remark else "")
+            yield f"{indent}{key}: {_text(_rounded(name, value, measured))}" + (f"  # {remark}" if remark else "")
+
+
+def _text(value: Any) -> str:
+    """A value in one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("\n...\n").strip()
 
 
 def _measures(content: Mapping[str, Any]) -> Iterator[str]:

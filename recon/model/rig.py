@@ -4,6 +4,7 @@ World is the frame of camera 1. Every field has a unit; nonsense is refused with
 """
 
 from collections.abc import Iterator
+from datetime import date
 from itertools import combinations, islice, permutations
 from typing import Annotated, Any, ClassVar, Self
 
@@ -14,6 +15,7 @@ from pydantic import BaseModel, Field, field_validator, model_serializer, model_
 from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import DISTORTION_LENGTHS, Camera
+from recon.model.calibration import Calibration, Uncertainty
 from recon.model.lengths import TARGET_CIRCLE, TARGET_STEP
 from recon.model.part import Finite, Fraction, Kinds, NotNegative, Part, Positive, Vector
 
@@ -22,6 +24,7 @@ LEAST_ASYMMETRY_MM = 2.0  # by which a target turned must miss itself, that its 
 LEAST_PARTED_MM = 2.0  # by which distances of three circles of two bodies must differ, that one isn't taken for the other
 PARTED_TOLERANCES = 10.0  # of a circle's place, by which they must differ, too
 PARTED_SIZES = 0.2  # of a diameter, by which circles of two bodies differ that are never taken for each other
+DEVICES = ("cam1", "cam2", "projector")  # those that are calibrated
 PROBE = "probe"  # name of the body that carries `Rig.target`
 PATIENT = "patient"  # name of the body in whose frame all is told, where a rig has it
 FOCAL_TOLERANCE = 0.05  # a lens's nominal focal length against the calibrated one
@@ -254,12 +257,45 @@ class Measured(Part):
     source: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
+class Identified(Part):
+    """The capture that a rig was identified from."""
+
+    day: date
+    capture: Annotated[str, Field(min_length=1)]  # its name
+
+
+class OpticsCovariance(Part):
+    """Covariance of the devices' optics as calibrated: names and units are those of `recon.model.calibration.Uncertainty`."""
+
+    names: tuple[Annotated[str, Field(pattern=r"^(cam1|cam2|projector)\.[a-z_0-9]+$")], ...]
+    rows: tuple[tuple[Finite, ...], ...]  # of its lower triangle, the diagonal included
+
+    @field_validator("rows")
+    @classmethod
+    def _triangle(cls, value: tuple[tuple[float, ...], ...], info) -> tuple[tuple[float, ...], ...]:
+        lengths, names = [len(row) for row in value], info.data.get("names", ())
+        if lengths != list(range(1, len(names) + 1)):
+            raise ValueError(f"expected a row a name, of 1 to {len(names)} numbers, found {lengths}")
+        if any(row[-1] < 0 for row in value):
+            raise ValueError("expected variances of 0 or more at the rows' ends, found less")
+        return value
+
+    def matrix(self) -> NDArray[np.float64]:
+        """The whole of it : (n, n)."""
+        lower = np.zeros((len(self.rows), len(self.rows)))
+        for k, row in enumerate(self.rows):
+            lower[k, : k + 1] = row
+        return lower + np.tril(lower, -1).T
+
+
 BodyName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 
 
 class Rig(Part):
     """The whole rig: two cameras, the projector, the probe with its target, and further bodies with a target each."""
 
+    version: Annotated[int, Field(ge=0)] = 0  # of the rig's file: one more with each identification; 0: written by hand
+    identified: Identified | None = None
     cam1: CameraDevice
     cam2: CameraDevice
     projector: ProjectorDevice
@@ -267,6 +303,7 @@ class Rig(Part):
     probe: Probe
     bodies: dict[BodyName, Target] = Field(default_factory=dict)  # such as a needle, or the patient
     measured: dict[str, Measured] = Field(default_factory=dict)  # by dotted names, such as cam1.lens.f_number
+    optics_covariance: OpticsCovariance | None = None  # errors of measured optics go together: each alone says little
 
     def __hash__(self) -> int:
         """Of all parts, as frozen models have it; a mapping has none of its own."""
@@ -298,6 +335,12 @@ class Rig(Part):
             except KeyError:
                 raise ValueError(f"measured: expected names of numbers, such as cam1.lens.f_number, found {name}") from None
         return self
+
+    def calibration(self) -> Calibration:
+        """Cameras and projector, with the covariance of what was measured of them."""
+        known = self.optics_covariance
+        uncertainty = None if known is None else Uncertainty(known.names, known.matrix(), has_scale=True)
+        return Calibration({name: getattr(self, name).optics.camera() for name in DEVICES}, uncertainty)
 
     @property
     def targets(self) -> dict[str, Target]:

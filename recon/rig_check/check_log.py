@@ -13,6 +13,7 @@ from recon.errors import validated
 from recon.files import atomic, json_text
 from recon.files.regular import MOST_TEXT, read_text
 from recon.model.rig import NotNegative, Part
+from recon.rig_check.rig_versions import Comparison
 from recon.rig_check.verdicts import State, Verdict
 
 EPOCH, END = datetime(1970, 1, 1, tzinfo=UTC), datetime(2200, 1, 1, tzinfo=UTC)  # of times that a computer's clock shows
@@ -36,6 +37,7 @@ class Check(Part):
     time: Annotated[AwareDatetime, Field(ge=EPOCH, lt=END)]
     name: str  # of the capture
     parts: tuple[Entry, ...] = Field(min_length=1)
+    rig: Comparison | None = None  # its numbers against those of its file
 
 
 def entry(verdict: Verdict) -> Entry:
@@ -45,9 +47,9 @@ def entry(verdict: Verdict) -> Entry:
     return Entry(part=verdict.part, state=verdict.state, motion=verdict.motion, rivals=verdict.rivals, **known)
 
 
-def check(name: str, verdicts: Sequence[Verdict]) -> Check:
+def check(name: str, verdicts: Sequence[Verdict], rig: Comparison | None = None) -> Check:
     """The record of a check that was made now."""
-    return Check(time=datetime.now(UTC).replace(microsecond=0), name=name, parts=tuple(map(entry, verdicts)))
+    return Check(time=datetime.now(UTC).replace(microsecond=0), name=name, parts=tuple(map(entry, verdicts)), rig=rig)
 
 
 def read(path: Path) -> list[Check]:

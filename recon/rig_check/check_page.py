@@ -1,4 +1,4 @@
-"""`check.html`: verdicts on all parts of the rig, and their course over the days of the log."""
+"""`check.html`: verdicts on all parts of the rig and on its numbers, and their course over the days of the log."""
 
 from collections.abc import Sequence
 from datetime import datetime, timedelta
@@ -9,7 +9,9 @@ from matplotlib import dates, ticker
 
 from recon.reports import figures, page
 from recon.reports.page import Opening, Section
+from recon.rig_check import rig_versions
 from recon.rig_check.check_log import Check, Entry
+from recon.rig_check.rig_versions import Comparison
 from recon.rig_check.verdicts import ANEW, PARTS, TITLES
 
 COLOURS = dict(zip(PARTS, ("#5b8db8", "#c8553d", "#d99b2b", "#6a9f58", "#8b6bb1", "#4f9c9c"), strict=True))
@@ -49,12 +51,14 @@ FOOTER = (
 
 def write_text(made: Check, log: Sequence[Check], alarm_sigma: float) -> str:
     """The page as HTML."""
+    numbers = [] if made.rig is None else [Section("Numbers of the rig", _numbers(made.rig, log))]
     sections = [
         Section("Parts", [page.table(("part", "verdict", "motion", "limit, 1 σ", "deviation", "in mm"), map(_row, made.parts))]),
-        Section("Over the days", _course(log, alarm_sigma)),
+        *numbers,
+        *([Section("Over the days", _course(log, alarm_sigma))] if any(map(_shows_parts, log)) else []),
         Section("How to read this", [page.paragraph(text) for text in reading(alarm_sigma)]),
     ]
-    return page.render(Opening("Check of the rig", made.name, summary(made.parts), _figures(made)), sections, FOOTER)
+    return page.render(Opening("Check of the rig", made.name, summary(made), _figures(made)), sections, FOOTER)
 
 
 def reading(alarm_sigma: float) -> tuple[str, ...]:
@@ -71,14 +75,20 @@ def reading(alarm_sigma: float) -> tuple[str, ...]:
     )
 
 
-def summary(parts: Sequence[Entry]) -> str:
-    """One sentence: what has moved, and what is to be done."""
+def summary(made: Check) -> str:
+    """What has moved or changed, and what is to be done, in a sentence or two."""
+    parts, told = made.parts, list[str]()
     moved = [one for one in parts if one.state == "moved"]
     if moved:
         named = ", ".join(" or ".join(TITLES[name] for name in (one.part, *one.rivals)) for one in moved)
-        return f"Moved: {named}. Run {', '.join(anew(parts))}."
-    names = {state: ", ".join(TITLES[one.part] for one in parts if one.state == state) for state in ("good", "open")}
-    told = [f"{word}: {names[state]}." for state, word in (("good", "As calibrated"), ("open", "Open")) if names[state]]
+        told = [f"Moved: {named}. Run {', '.join(anew(parts))}."]
+    else:
+        names = {state: ", ".join(TITLES[one.part] for one in parts if one.state == state) for state in ("good", "open")}
+        told = [f"{word}: {names[state]}." for state, word in (("good", "As calibrated"), ("open", "Open")) if names[state]]
+    if made.rig is not None and made.rig.changed:
+        told += [f"Changed: {rig_versions.told(made.rig.changed)}. If it is meant, go on with today's file of the rig."]
+    elif made.rig is not None:
+        told += [f"Numbers of the rig as in {made.rig.before.text}."]
     return " ".join(told) or "Nothing could be checked."
 
 
@@ -104,8 +114,60 @@ def shown(one: Entry) -> Shown:
 
 
 def lines(made: Check) -> list[str]:
-    """A head and a line a part, for the terminal."""
-    return [_line(("part", "verdict", "deviation", "in mm", "limit, 1 σ", "motion")), *map(_line_of, made.parts)]
+    """A head and a line a part, and if the rig's numbers were compared a line a device, for the terminal."""
+    head = _line(("part", "verdict", "deviation", "in mm", "limit, 1 σ", "motion"))
+    return [head, *map(_line_of, made.parts), *([] if made.rig is None else _number_lines(made.rig))]
+
+
+def _number_lines(rig: Comparison) -> list[str]:
+    """A line on the files, and one a device with what has changed most of it, and all that has."""
+    found = []
+    for device in dict.fromkeys(one.device for one in rig.numbers):
+        own = [one for one in rig.numbers if one.device == device]
+        changed = [one for one in own if one.changed]
+        words = "; ".join(f"{one.title} {one.change}, {one.sigma:.1f} σ" for one in changed)
+        verdict, deviation = ("changed" if changed else f"{len(own)} as in rig"), max(one.sigma for one in own)
+        found.append(_line((f"{TITLES.get(device, device)}, numbers", verdict, f"{deviation:.1f} σ", "", "", words)))
+    return [f"rig         {_compared(rig)}", *found]
+
+
+def _compared(rig: Comparison) -> str:
+    """The files, and how many numbers of them."""
+    over = f"; {rig.taken_over} taken over from the file" if rig.taken_over else ""
+    return f"{rig.today.text} against {rig.before.text}: {len(rig.numbers)} numbers, limit {rig.limit_sigma:.1f} σ{over}"
+
+
+def _numbers(rig: Comparison, log: Sequence[Check]) -> list[str]:
+    """All numbers by device, their meaning, and the largest deviations over the days."""
+    head = ("device", "number", "verdict", "change", "deviation")
+    rows = [
+        (
+            TITLES.get(one.device, one.device),
+            one.title,
+            "changed" if one.changed else "as in rig",
+            one.change,
+            f"{one.sigma:.1f} σ",
+        )
+        for one in rig.numbers
+    ]
+    reading = (
+        f"A number has changed where its deviation is beyond {rig.limit_sigma:.1f} σ: of a rig that has not changed, one "
+        f"comparison of {1 / rig.chance:.0f} flags any. Optics and place of a device are compared as a whole each, as errors of "
+        "their numbers go together; usual drift is in it. Numbers that were not measured in both files do not count."
+    )
+    worst = [one.model_copy(update={"parts": _largest(one.rig)}) for one in log if one.rig is not None]
+    seen = {part.part for one in worst for part in one.parts}
+    caption = f"Dashed: today's limit of {rig.limit_sigma:.1f} σ. {SIGMA.caption(worst)}"
+    drawing = page.drawing(_plot(worst, SIGMA, rig.limit_sigma), "The largest deviation of each device's numbers", caption)
+    key = page.key({TITLES[part]: COLOURS[part] for part in PARTS if part in seen})
+    return [page.table(head, rows, f"{_compared(rig)}."), page.paragraph(reading), key, drawing]
+
+
+def _largest(rig: Comparison) -> tuple[Entry, ...]:
+    """The largest deviation of each device's numbers, as of a part."""
+    devices = {one.device for one in rig.numbers}
+    largest = {part: max(one.sigma for one in rig.numbers if one.device == part) for part in PARTS if part in devices}
+    return tuple(Entry(part=part, state="good", sigma=sigma) for part, sigma in largest.items())
 
 
 def _line_of(one: Entry) -> str:
@@ -126,10 +188,18 @@ def _row(one: Entry) -> tuple[str, ...]:
 
 
 def _figures(made: Check) -> list[tuple[str, str, str]]:
-    worst = max((one.sigma for one in made.parts if one.sigma is not None), default=0.0)
+    numbers = () if made.rig is None else made.rig.numbers
+    worst = max((one.sigma for one in (*made.parts, *numbers) if one.sigma is not None), default=0.0)
     moved = sum(one.state == "moved" for one in made.parts)
     checked = sum(one.state != "unseen" for one in made.parts)
-    return [("parts checked", str(checked), ""), ("moved", str(moved), ""), ("largest deviation", f"{worst:.1f}", "σ")]
+    figures = [("parts checked", str(checked), ""), ("moved", str(moved), ""), ("largest deviation", f"{worst:.1f}", "σ")]
+    if made.rig is not None:
+        figures += [("numbers compared", str(len(made.rig.numbers)), ""), ("changed", str(len(made.rig.changed)), "")]
+    return figures
+
+
+def _shows_parts(made: Check) -> bool:
+    return any(one.sigma is not None for one in made.parts)
 
 
 def _course(log: Sequence[Check], alarm_sigma: float) -> list[str]:

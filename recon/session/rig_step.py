@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
 from recon.capture.board_part import BoardCapture
 from recon.capture.images import image_files, read_images
-from recon.capture.manifest import Device, Manifest, PartName, read_manifest
+from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
 from recon.files import atomic
@@ -72,11 +73,14 @@ class Settings(Part):
     capture: Path
     """a capture folder with a board, a surface under fringes, or both"""
     rig: Annotated[Rig, Choice("meza2021")]
-    """to begin with: what isn't measured stays as it has it, such as the pixels' size"""
+    """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
+    day: date | None = None
+    """of the capture, such as 2026-11-30; null: that of its manifest.json, in UTC"""
     calibration: Path | None = None
     """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
     dark: Path | None = None
-    """folder of images with covered lenses, in cam1/ and cam2/, exposed as the capture's: black level, dark noise, DSNU"""
+    """folder of images with covered lenses, in cam1/ and cam2/, exposed as the capture's: black level, dark noise, DSNU; null:
+    dark/ in the capture, if it is there; likewise flat/ and room/"""
     flat: Path | None = None
     """the same of an even light, at one level, or at several in a folder each, such as cam1/half/: gain, PRNU"""
     room: Path | None = None
@@ -100,9 +104,11 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     rig, found = identify(settings, watch)
     for line in describe(found):
         watch.say(line)
+    name = read_manifest(settings.capture).name or settings.capture.resolve().name
+    rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
         (
-            f"A rig as identified from {settings.capture.resolve().name}: numbers with an uncertainty (1 sigma) were measured,",
+            f"A rig as identified from {name}: numbers with an uncertainty (1 sigma) were measured,",
             "others are as in the rig that it began with, or in its calibration. `sonotwin VERB rig=FILE` takes it.",
         )
     )
@@ -111,13 +117,17 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         (new / CONDITIONS).write_text(conditions_text(found), encoding="utf-8")
         content = json.dumps(asdict(found), indent=2, ensure_ascii=False, allow_nan=False)
         (new / FIGURES).write_text(content + "\n", encoding="utf-8")
-    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}")
+    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}, version {rig.version} of the rig")
+
+
+def _day(path: Path) -> date:
+    return datetime.fromtimestamp(path.stat().st_mtime, UTC).date()
 
 
 @linear_algebra.on_one_thread()
 def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
     """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
-    manifest = read_manifest(settings.capture)
+    manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
     if manifest.board is None and manifest.surface is None:
         raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
     part: PartName = "board" if manifest.surface is None else "surface"
@@ -151,6 +161,12 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
     return rig_file.apply(rig, found), found
+
+
+def _with_own_frames(settings: Settings) -> Settings:
+    """Settings with the capture's own folders of further images, where no others are given."""
+    own = {name: settings.capture / name for name in ("dark", "flat", "room") if getattr(settings, name) is None}
+    return settings.model_copy(update={name: folder for name, folder in own.items() if folder.is_dir()})
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,15 @@
 Reads a capture folder with the calibrations in use and any of three parts, taken before a session in two minutes: a film in which
 both cameras see the target moved about, tilted to all sides; a fringe sequence of anything smooth, seen by both cameras, best
 with fringes along both axes; and ten seconds of tracked B-scans over a flat, rough bottom in water, the probe rolled, tilted and
-moved up and down. Writes into the folder `out` check.html, the verdicts with their course over the days of `log`, and check.json.
-An error that the calibrations admit by their covariance, and usual drift, are no alarm; where nothing else has moved, optics.yaml
-beside them is the calibration corrected for such drift. Exit status 1 if something has moved. Takes some seconds.
+moved up and down. With `today`, the folder that `sonotwin identify` made of today's captures, its numbers are compared with those
+of `rig`, the file of an earlier one; without a capture they alone are. Writes into the folder `out` check.html, the verdicts with
+their course over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual drift,
+are no alarm; where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit status 1 if
+something has moved or changed. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
+    sonotwin check today=outputs/today out=outputs/check log=outputs/rig.jsonl
 """
 
 from collections.abc import Collection, Sequence
@@ -26,17 +29,20 @@ from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Target
 from recon.probe_calibration import sound_in_water
-from recon.rig_check import bottom_equations, check_log, check_page, drift, verdicts
+from recon.rig_check import bottom_equations, check_log, check_page, drift, rig_versions, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR
+from recon.rig_check.rig_versions import Comparison
 from recon.rig_check.verdicts import Optics, Verdict
-from recon.session import drift_step, latency_step, poses_step
+from recon.session import drift_step, latency_step, poses_step, rig_step
 from recon.session.tracker_settings import MeasuredTargetFields, make_tracker, target_of
 from recon.target_calibration import target_poses
 from recon.tracking import track_figures
 from recon.tracking.pose_fit import Sighting
+from sonotwin import choices
 from sonotwin.console_watch import ConsoleWatch
 
+DEVICES = (*CAMERAS, PROJECTOR, "target")  # what film and fringes show
 CHECK, PAGE = "check.json", "check.html"
 UNKNOWN_LAG_S = 1.0  # standard deviation of a lag that wasn't measured
 LEAST_POSES = 3
@@ -46,8 +52,10 @@ FAR_MM = 2.0  # of a motion, beyond which equations are far from linear
 class Config(MeasuredTargetFields):
     """Fields of `sonotwin check`."""
 
-    capture: Path
-    """folder: what it holds of these is checked: a film of the target, fringes before both cameras, a bottom"""
+    capture: Path | None = None
+    """folder: what it holds of these is checked: a film of the target, fringes before both cameras, a bottom; null with today"""
+    today: Path | None = None
+    """folder of sonotwin identify, or its rig.yaml, whose numbers are compared with those measured in `rig`"""
     out: Path
     """folder: gets check.html, check.json, and optics.yaml, corrected for drift, where no device was moved"""
     log: Path | None = None
@@ -65,7 +73,7 @@ class Config(MeasuredTargetFields):
     lag: Path | None = None
     """file lag.json, of measure-lag; null leaves the scanner's clock unchecked"""
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
-    """standard deviations beyond which a part has moved: one check of 120 by chance, over all six parts"""
+    """standard deviations beyond which a part has moved: one check of 120 by chance, over all six parts, or over all numbers"""
     water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
     """deg C, of the tank"""
     water_sigma_c: NotNegative = 1.0
@@ -95,22 +103,33 @@ def run(config: Config) -> int:
         If the capture is incomplete or damaged or holds nothing that can be checked, or a place can't be written to.
     """
     watch = ConsoleWatch()
-    given = (config.capture, config.tracked, config.calibration, config.probe, config.lag, config.target, config.log)
+    given = (
+        config.capture,
+        config.today,
+        config.tracked,
+        config.calibration,
+        config.probe,
+        config.lag,
+        config.target,
+        config.log,
+    )
     atomic.check_folder(config.out, "check", inputs=given)  # the log, too: a folder that is replaced would take it along
     earlier = check_log.read(config.log) if config.log is not None and config.log.exists() else []
-    listed = manifest.read_manifest(config.capture)
-    held = parts_of(config, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
-    for line in left_out(held):
-        watch.say(line)
-    devices, corrected = optics(config, listed, held, watch)
-    found = [*devices, *verdicts.doubted(tank(config, held, watch), devices)]
-    made = check_log.check(listed.name or config.capture.resolve().name, found)
+    rig = None if config.today is None else compared(config, config.today)
+    found, corrected = [Verdict(part, "unseen") for part in verdicts.PARTS], None
+    if config.capture is not None:
+        name, found, corrected = checked(config, config.capture, watch)
+    elif rig is not None:
+        name = "numbers" if rig.today.identified is None else rig.today.identified.capture
+    else:
+        raise InputError("capture: expected a capture folder, or today=FOLDER of sonotwin identify, found neither")
+    made = check_log.check(name, found, rig)
     for line in check_page.lines(made):
         watch.say(line)
-    if any(one.state == "moved" and one.mm > FAR_MM for one in devices):
+    if any(one.state == "moved" and one.mm > FAR_MM for one in found if one.part in DEVICES):
         cause = "is it this rig's calibration, and are the images each camera's own?"
         watch.say(f"warning     motions of {FAR_MM:g} mm and more are told roughly, and others may be named for them: {cause}")
-    watch.say(f"verdict     {check_page.summary(made.parts)}")
+    watch.say(f"verdict     {check_page.summary(made)}")
     with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
@@ -119,10 +138,31 @@ def run(config: Config) -> int:
         if config.log is not None:  # last, so that whatever fails leaves both as they were
             check_log.add(config.log, made)
     watch.say(f"wrote       {config.out}/{{{','.join([CHECK, PAGE, *([drift_step.OPTICS] if corrected else [])])}}}")
-    return int(any(one.state == "moved" for one in found))
+    return int(any(one.state == "moved" for one in found) or (rig is not None and len(rig.changed) > 0))
 
 
-def parts_of(config: Config, listed: Manifest, tracked: Manifest) -> Held:
+def compared(config: Config, today: Path) -> Comparison:
+    """Today's numbers against those of the rig's file; InputError if either has none, or as of `rig_versions.compare`."""
+    if not config.rig.measured:
+        raise InputError("rig: expected a rig's file that sonotwin identify wrote, found one of which no number was measured")
+    file = today / rig_step.RIG if today.is_dir() else today
+    if not file.is_file():
+        raise InputError(f"{file}: expected a rig's file, found none; give today=FOLDER of sonotwin identify")
+    return rig_versions.compare(config.rig, choices.read_rig(file), config.drift_px, config.alarm_sigma)
+
+
+def checked(config: Config, capture: Path, watch: ConsoleWatch) -> tuple[str, list[Verdict], Calibration | None]:
+    """A capture's name, the verdicts on all parts, and the calibration corrected for drift, if there is no more than that."""
+    listed = manifest.read_manifest(capture)
+    held = parts_of(config, capture, listed, listed if config.tracked is None else manifest.read_manifest(config.tracked))
+    for line in left_out(held):
+        watch.say(line)
+    devices, corrected = optics(config, capture, listed, held, watch)
+    found = [*devices, *verdicts.doubted(tank(config, capture, held, watch), devices)]
+    return listed.name or capture.resolve().name, found, corrected
+
+
+def parts_of(config: Config, capture: Path, listed: Manifest, tracked: Manifest) -> Held:
     """Parts that can be checked.
 
     tracked : of the folder that has the bottom's poses.
@@ -136,13 +176,13 @@ def parts_of(config: Config, listed: Manifest, tracked: Manifest) -> Held:
     films = [name for name, part in sweeps.items() if set(CAMERAS) <= part.images.keys() and SCANNER not in part.images]
     bottoms = [name for name, part in followed.items() if SCANNER in part.images and part.track is not None]
     wanted = [name for name in bottoms if followed[name].purpose == "latency"] or bottoms
-    film = _the_one("film", config.film, sweeps, films, config.capture)
-    bottom = _the_one("bottom", config.bottom, followed, wanted, config.tracked or config.capture)
+    film = _the_one("film", config.film, sweeps, films, capture)
+    bottom = _the_one("bottom", config.bottom, followed, wanted, config.tracked or capture)
     fringes = listed.surface is not None and set(CAMERAS) <= listed.surface.images.keys()
     if film is None and bottom is None and not fringes:
         expected = "frames of the target, fringes before both cameras, or tracked B-scans of a bottom"
         way = "name a film that has B-scans, too, by film; sweeps are tracked by sonotwin track, whose folder is tracked"
-        raise InputError(f"{config.capture / MANIFEST}: expected {expected}, found none of them; {way}")
+        raise InputError(f"{capture / MANIFEST}: expected {expected}, found none of them; {way}")
     return Held(film, fringes, bottom)
 
 
@@ -166,19 +206,21 @@ def left_out(held: Held) -> list[str]:
     return [f"{name:12}{way}" for name, (lacking, way) in ways.items() if lacking]
 
 
-def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) -> tuple[list[Verdict], Calibration | None]:
+def optics(
+    config: Config, capture: Path, listed: Manifest, held: Held, watch: ConsoleWatch
+) -> tuple[list[Verdict], Calibration | None]:
     """Verdicts on cameras, projector and target, and the calibration corrected for drift, where they show no more than drift."""
     if held.film is None and not held.fringes:
-        return [Verdict(part, "unseen") for part in (*CAMERAS, PROJECTOR, "target")], None
-    file = listed.calibration_file(config.capture, config.calibration)
+        return [Verdict(part, "unseen") for part in DEVICES], None
+    file = listed.calibration_file(capture, config.calibration)
     wanted = [*CAMERAS, *([PROJECTOR] if held.fringes else [])]
     sizes = {name: device.size for name, device in listed.devices.items() if name in wanted}
     calibration = calibration_files.read_for(file, sizes)
     if calibration.uncertainty is None:
         watch.say(f"warning     {file}: no covariance: an error of the calibration is taken for a motion")
     target = target_of(config)
-    film = None if held.film is None else filmed(config, held.film, target, calibration, watch)
-    matches = drift_step.match_fringes(config.capture, config.calibration, listed, calibration, watch) if held.fringes else None
+    film = None if held.film is None else filmed(config, capture, held.film, target, calibration, watch)
+    matches = drift_step.match_fringes(capture, config.calibration, listed, calibration, watch) if held.fringes else None
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
@@ -195,10 +237,10 @@ def optics(config: Config, listed: Manifest, held: Held, watch: ConsoleWatch) ->
 
 
 def filmed(
-    config: Config, name: str, target: Target, calibration: Calibration, watch: ConsoleWatch
+    config: Config, capture: Path, name: str, target: Target, calibration: Calibration, watch: ConsoleWatch
 ) -> list[tuple[Sighting, Sighting]]:
     """Pairs of frames in which both cameras see the target whole, in poses that differ."""
-    film = stereo_frames.read_film(config.capture, config.calibration, name)
+    film = stereo_frames.read_film(capture, config.calibration, name)
     wide = config.model_copy(update={"drift_px": drift_step.SEARCH_PX})
     tracker = make_tracker(wide, target, film.cameras, film.optics, film.bits)
     pairs = watch.follow(film.pairs(), len(film.times), "tracking")
@@ -215,19 +257,17 @@ def filmed(
     return [one.views for one in poses]
 
 
-def tank(config: Config, held: Held, watch: ConsoleWatch) -> list[Verdict]:
+def tank(config: Config, capture: Path, held: Held, watch: ConsoleWatch) -> list[Verdict]:
     """Verdicts on probe and clock."""
     parts = (bottom_equations.PROBE, bottom_equations.CLOCK)
     lag = None if config.lag is None else lag_files.read(config.lag)
     given = None if config.probe is None else probe_files.read(config.probe)
     if held.bottom is None:
         return [Verdict(part, "unseen") for part in parts]
-    sweep = sweep_part.read_sweep(config.tracked or config.capture, held.bottom, implausible=config.implausible)
+    sweep = sweep_part.read_sweep(config.tracked or capture, held.bottom, implausible=config.implausible)
     probe = given or sweep.probe
     if probe is None:
-        raise InputError(
-            f"{config.capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe"
-        )
+        raise InputError(f"{capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe")
     if probe.uncertainty is None:
         watch.say("warning     probe: no covariance: an error of its calibration is taken for a bent bracket")
     known = Known(in_water(probe, config), *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)))

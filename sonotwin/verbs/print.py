@@ -1,12 +1,14 @@
-"""Draw a calibration board or a body's target for a printer: a PDF, true to scale.
+"""Draw a calibration board or a body's target for a printer, true to scale, or the card by which a rig is recorded: a PDF.
 
 `part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the rings of
 `rig.target`, or of another `body` of the rig. `family=3` draws three targets, a page each, of which none is taken for another,
 and prints the lines that describe all but the first as bodies of a rig. Around the card to cut out are cut marks, a ruler of
-100 mm along each axis, and its lengths in small print. Writes the file `out`; one that is there is replaced. Takes a second.
+100 mm along each axis, and its lengths in small print. `part=protocol` is a page for whoever records a rig that `sonotwin
+identify` is to measure: six steps, with what is to be seen at each. Writes the file `out`; one that is there is replaced. Takes a
+second.
 
-Print at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper wherever board or
-target are described: docs/calibration.md says how.
+Print boards and targets at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper
+wherever board or target are described: docs/calibration.md says how.
 
     sonotwin print part=board out=board.pdf
     sonotwin print part=board board='{kind: charuco, columns: 8, rows: 11, square_mm: 20, marker_mm: 15}' paper=a4 out=charuco.pdf
@@ -14,6 +16,7 @@ target are described: docs/calibration.md says how.
     sonotwin print part=target out=target.pdf
     sonotwin print part=target rig=three_bodies body=needle out=needle.pdf
     sonotwin print part=target family=3 rig=three_bodies out=targets.pdf
+    sonotwin print part=protocol paper=letter out=protocol.pdf
 """
 
 from pathlib import Path
@@ -21,7 +24,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from recon.artwork import board_drawing, paper_sheet, target_drawing
+from recon.artwork import board_drawing, paper_sheet, protocol_card, target_drawing
 from recon.artwork.paper_sheet import PAPERS, Card, Page, Sheet, Size
 from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.errors import InputError, did_you_mean
@@ -46,8 +49,8 @@ class Config(BaseModel):
 
     rig: Annotated[Rig, Choice("meza2021")]
     """of it, the target's lengths and the size of its board"""
-    part: Literal["board", "target"]
-    """board, for cameras and projector; or target, for the probe"""
+    part: Literal["board", "target", "protocol"]
+    """board, for cameras and projector; target, for the probe; or protocol, what to record of a rig in 20 minutes"""
     out: Path
     """the PDF to write"""
     body: str = PROBE
@@ -63,11 +66,12 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _board_to_draw(self) -> "Config":
-        if self.part == "target" and self.board is not None:
-            raise ValueError("board: expected none with part=target, which draws rig.target")
+        if self.part != "board" and self.board is not None:
+            drawn = "draws rig.target" if self.part == "target" else "draws none"
+            raise ValueError(f"board: expected none with part={self.part}, which {drawn}")
         for name, value in (("body", self.body if self.body != PROBE else None), ("family", self.family)):
-            if self.part == "board" and value is not None:
-                raise ValueError(f"{name}: expected none with part=board, found {value}")
+            if self.part != "target" and value is not None:
+                raise ValueError(f"{name}: expected none with part={self.part}, found {value}")
         if self.body not in self.rig.targets:
             raise ValueError(f"body: expected one of {', '.join(self.rig.targets)}, found {self.body}{near(self.body, self.rig)}")
         return self
@@ -88,10 +92,27 @@ def run(config: Config) -> None:
     if config.out.is_file() and not paper_sheet.is_sheet(config.out):
         expected, found = "expected nothing or a sheet as it was written", "found a file of others, or a changed one"
         raise InputError(f"{config.out}: {expected}, {found}; choose another out")
-    if config.part == "target":
+    if config.part == "protocol":
+        write_protocol(config)
+    elif config.part == "target":
         draw_targets(config, config.rig.targets[config.body])
     else:
         draw_board(config, USUAL if config.board is None else design(config.board))
+
+
+def write_protocol(config: Config) -> None:
+    """Write the card of what to record; raises InputError with the paper that is large enough."""
+    paper = PAPERS[config.paper] if isinstance(config.paper, str) else config.paper
+    if paper[0] < PAPERS["a4"][0] or paper[1] < PAPERS["letter"][1]:
+        expected = "210x279.4 mm or more, upright, for the protocol's page"
+        raise InputError(f"paper: expected {expected}, found {paper[0]:g}x{paper[1]:g} mm; give paper=a4 or paper=letter")
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    with atomic.new_file(config.out) as path:
+        protocol_card.write(path, paper, config.margin_mm)
+    minutes = sum(step.minutes for step in protocol_card.STEPS)
+    print(f"{config.part:11} {len(protocol_card.STEPS)} steps, {minutes} minutes")
+    print(f"wrote       {config.out}")
+    print(f"next        {protocol_card.AFTER}")
 
 
 def draw_board(config: Config, board: Board) -> None:

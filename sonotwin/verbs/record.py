@@ -1,11 +1,13 @@
-"""Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep.
+"""Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep, frames.
 
 Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
 focus, fringes, whether the target is found, each fault and its remedy. Each next pose of the board is chosen as the one that
 adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
 poses are added to those that are there, sweeps have names, a new surface takes the place of the old one only with
-replace=true. Later verbs take OUT itself: capture=OUT. All that was recorded is on the disk at once and whole, whether the
-command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
+replace=true. Frames of covered lenses (dark), of an even light (flat) and of the scene without the projector (room), which
+`sonotwin identify` finds in the folder, are recorded after the surface, by whose exposure dark and room are. Later verbs take OUT
+itself: capture=OUT. All that was recorded is on the disk at once and whole, whether the command is ended by Ctrl-C, by the system
+or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
 this list say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
@@ -14,6 +16,7 @@ that begins with `defaults: [basler]`: devices=ours.yaml.
 
     sonotwin record part=board patterns=paper_calibration out=outputs/session
     sonotwin record part=surface devices=basler calibration=optics.yaml out=outputs/session
+    sonotwin record part=dark devices=basler out=outputs/session
     sonotwin record part=sweep name=scan purpose=volume out=outputs/session
     sonotwin record part=sweep name=wires purpose=probe shots=true scene=crosswire path=wire out=outputs/session
 """
@@ -22,7 +25,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import Field, model_validator
 from rich.console import Console
@@ -31,6 +34,7 @@ from recon.acquisition import preview_server
 from recon.acquisition.board_recording import BoardPlan, record_board
 from recon.acquisition.exposure_setting import Exposing
 from recon.acquisition.frame_checks import Limits
+from recon.acquisition.frames_recording import FramesPlan, Kind, record_frames
 from recon.acquisition.guidance import Operator
 from recon.acquisition.pictures import Say, Show, hidden
 from recon.acquisition.recording import SURFACE, Recording, open_recording
@@ -43,7 +47,7 @@ from recon.artwork import projected_images
 from recon.board_detection.kinds.asymmetric_circles import AsymmetricCircles
 from recon.board_guidance.board_room import PoseLimits
 from recon.capture.board_part import FRINGE_CAMERA
-from recon.capture.manifest import SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
+from recon.capture.manifest import MANIFEST, SCANNER, Device, Purpose, SweepNameOrNone, axes_not_encoded, sweep_part
 from recon.devices.interfaces import Trigger
 from recon.devices.pattern_player import Pattern, Stage, Streamed, Taking, Triggered
 from recon.errors import InputError, validated
@@ -104,8 +108,8 @@ class Config(NetworkFields):
     """virtual: the twin; basler: two cameras, a projector, a scanner; a YAML file of your own for those of a laboratory"""
     patterns: Annotated[Patterns, Choice("paper_surface")]
     """what the projector shows; of a board along both axes, such as paper_calibration"""
-    part: Literal["board", "surface", "sweep"]
-    """board, surface or sweep"""
+    part: Literal["board", "surface", "dark", "flat", "room", "sweep"]
+    """board, surface or sweep; or frames for identify: dark (covered lenses), flat (an even light), room (no projector)"""
     out: Path
     """the capture folder, a new one or one that grows"""
     cameras: Annotated[list[Literal["cam1", "cam2"]], Field(min_length=1, default=["cam1", "cam2"])]
@@ -115,7 +119,7 @@ class Config(NetworkFields):
     probe: Path | None = None
     """file: the probe's calibration, copied into the capture"""
     replace: bool = False
-    """true: a surface takes the place of the one that is there; the truth beside a rendered one won't fit any more"""
+    """true: a surface or frames take the place of those that are there; the truth beside a rendered one won't fit any more"""
     board: Board = AsymmetricCircles(columns=4, rows=11, spacing_mm=15.0, diameter_mm=9.0)
     """the calibration board's design: kind, columns, rows and lengths, see docs/captures.md"""
     count: Annotated[int, Field(ge=1, le=1000)] = 12
@@ -206,6 +210,25 @@ def check_place(config: Config, recording: Recording) -> None:
         found = f"found that of {recording.surface_day}"
         found += f", and {truth}, which a recorded one wouldn't fit" if rendered else ""
         raise InputError(f"{recording.folder}: surface: expected none yet, {found}; give another out=FOLDER, or replace=true")
+    if config.part in get_args(Kind):
+        exposures(config, recording)
+        if (place := recording.folder / config.part).is_dir() and not config.replace:
+            raise InputError(f"{place}: expected none yet, found a folder; give another out=FOLDER, or replace=true")
+
+
+def exposures(config: Config, recording: Recording) -> dict[str, Device]:
+    """The cameras as fringes, or else a board, were taken; InputError if there is neither."""
+    for part in ("surface", "board"):
+        if getattr(recording.contents, part) is not None:
+            found = recording.contents.devices_of(part)
+            lacking = [name for name in config.cameras if name not in found or found[name].exposure_s is None]
+            if not lacking:
+                return {name: found[name] for name in config.cameras}
+            raise InputError(
+                f"{recording.folder / MANIFEST}: expected exposure_s of {lacking[0]}, as frames are exposed, found none"
+            )
+    expected = f"expected a surface or a board, as {config.part} frames are exposed"
+    raise InputError(f"{recording.folder / MANIFEST}: {expected}, found neither; record part=surface first")
 
 
 @contextmanager
@@ -242,6 +265,10 @@ def still(config: Config, recording: Recording, console: Console, say: Say, show
             plan = SurfacePlan(config.patterns, patterns, config.exposing, config.limits)
             kept = record_surface(recording, stage, operator, plan, say, show)
             say(f"kept {config.patterns.count} images of {' and '.join(opened.cameras)}" if kept else "nothing kept")
+        elif config.part in ("dark", "flat", "room"):
+            plan = FramesPlan(config.part, exposures(config, recording))
+            kept = record_frames(recording, stage, operator, plan, say, show)
+            say(f"kept frames of {' and '.join(opened.cameras)}" if kept else "nothing kept")
         else:
             fields = {name: getattr(config, name) for name in ("board", "patterns", "exposing", "limits", "rig", "reach", "seed")}
             names = record_board(recording, stage, operator, BoardPlan(shown=patterns, poses=config.count, **fields), say, show)
@@ -264,6 +291,12 @@ def still_devices(config: Config, patterns: list[Pattern], console: Console) -> 
     with console.status("setting up the scene"):
         if config.part == "surface":
             virtual = virtual_session.before_scene(settings, config.scene, patterns)
+        elif config.part == "dark":
+            virtual = virtual_session.covered(settings)
+        elif config.part == "flat":
+            virtual = virtual_session.before_paper(settings)
+        elif config.part == "room":
+            virtual = virtual_session.without_projector(settings, config.scene)
         else:
             virtual = virtual_session.before_board(settings, config.board, patterns, config.count)
     yield Opened(virtual.cameras, virtual.projector), virtual.operator

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from recon.capture import calibration_files, lag_files, probe_files
 from recon.capture.lag_files import LagFile
 from recon.geometry import rigid
+from recon.identification import rig_file
+from recon.identification.estimates import Estimate, Findings
 from recon.model.calibration import Calibration, Uncertainty
 from recon.model.probe import ProbeCalibration
 from recon.probe_calibration.sound_in_water import speed_of_sound
@@ -108,6 +111,48 @@ def test_a_film_by_another_rig_s_calibration_is_not_called_dirty_only(rig, tmp_p
     assert "or is the calibration another rig's" in capsys.readouterr().err
     assert main([*line, f"lag={tmp_path / 'none.json'}"]) == 2
     assert "none.json: expected a file, found none" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def write_rig(path, rig, version, **off):
+    """A rig's file of two measured numbers, some off by so much."""
+    sigmas = {"cam1.lens.focus_mm": 1.0, "projector.gamma": 0.01}
+    found = {name: Estimate(rig.number(name) + off.get(name, 0.0), sigma, "a test") for name, sigma in sigmas.items()}
+    known = rig_file.next_version(rig_file.apply(rig, Findings(found)), f"day {version}", date(2026, 5, version))
+    path.parent.mkdir(exist_ok=True)
+    rig_file.write(path, known.model_copy(update={"version": version}), {}, "a test")
+
+
+@pytest.mark.parametrize(("focus_mm", "status"), [(0.5, 0), (12.0, 1)])
+def test_a_rig_s_numbers_are_compared_with_its_file_and_logged(rig, tmp_path, capsys, focus_mm, status):
+    """Without a capture of the parts; the folder of identify and its file are the same."""
+    write_rig(tmp_path / "rig.yaml", rig, 3)
+    write_rig(tmp_path / "today/rig.yaml", rig, 4, **{"cam1.lens.focus_mm": focus_mm, "projector.gamma": 0.001})
+    for today in ("today", "today/rig.yaml"):
+        line = [f"rig={tmp_path / 'rig.yaml'}", f"today={tmp_path / today}", f"log={tmp_path / 'log.jsonl'}"]
+        assert main(["check", *line, f"out={tmp_path / 'out'}"]) == status
+    said, page = capsys.readouterr().out, (tmp_path / "out/check.html").read_text(encoding="utf-8")
+    assert "version 4 (2026-05-04, day 4) against version 3 (2026-05-03, day 3): 2 numbers, limit 2.9" in said
+    assert ("Changed: camera 1's lens: focus. If" in said) == ("Changed: camera 1" in page) == bool(status)
+    told = f"lens: focus +12 ± 1.4 mm, from {rig.cam1.lens.focus_mm:g} mm, 8.5 σ"
+    assert (told in said) == bool(status)
+    assert "Numbers of the rig" in page and page.count("<svg") == 1
+    logged = [json.loads(each)["rig"] for each in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [one["numbers"][0]["changed"] for one in logged] == 2 * [bool(status)]
+
+
+def test_rigs_that_say_nothing_of_each_other_are_refused(rig, tmp_path, capsys):
+    """In one line, with nothing written."""
+    write_rig(tmp_path / "rig.yaml", rig, 3)
+    ours = f"rig={tmp_path / 'rig.yaml'}"
+    for given, told in (
+        ([], "capture: expected a capture folder, or today="),
+        ([f"today={tmp_path / 'rig.yaml'}"], "rig: expected a rig's file that sonotwin identify wrote"),
+        ([ours, f"today={tmp_path / 'none'}"], "none: expected a rig's file, found none"),
+        ([ours, f"today={tmp_path}"], "found 2 that are the same"),
+    ):
+        assert main(["check", *given, f"out={tmp_path / 'out'}"]) == 2
+        said = capsys.readouterr().err
+        assert told in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 SEED = 21  # of calibration, drift, prints, hand and light: nothing was tried on it

@@ -1,6 +1,7 @@
 """`sonotwin identify`, from captures to a rig's file that other verbs take."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -46,12 +47,13 @@ def frames(tmp_path_factory) -> Path:
 def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsys):
     """The black level, light without gamma, and the optics as the capture has them."""
     given = [f"capture={capture}", f"dark={frames / 'dark'}", f"flat={frames / 'flat'}", f"out={tmp_path / 'ours'}"]
-    assert main(["identify", *given]) == 0
+    assert main(["identify", *given, "day=2026-05-04"]) == 0
     said = capsys.readouterr().out
     found = json.loads((tmp_path / "ours" / "identified.json").read_text())
     rig = read_rig(tmp_path / "ours" / "rig.yaml")
     assert rig.cam1.optics.size == SIZE and rig.projector.optics.size == PROJECTOR
     assert rig.cam2 == read_rig().cam2
+    assert (rig.version, rig.identified.capture, str(rig.identified.day)) == (1, "capture", "2026-05-04")
     for name, true in (("cam1.sensor.black_level_dn", 6.0), ("projector.gamma", 1.0)):
         known = rig.measured[name]
         assert abs(rig.number(name) - true) < 4 * known.sigma and known.sigma < 0.1 * true, name
@@ -64,9 +66,14 @@ def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsy
 
 
 def test_without_frames_what_they_show_is_unknown_and_files_of_others_stay(capture, tmp_path):
-    out = tmp_path / "ours"
-    for _ in range(2):
-        assert main(["identify", f"capture={capture}", f"out={out}"]) == 0
+    """Identified anew from its own file, it is the second version, of the day of the capture."""
+    out, before = tmp_path / "ours", []
+    os.utime(capture / "manifest.json", (1777852800, 1777852800))
+    for version in (1, 2):
+        assert main(["identify", f"capture={capture}", f"out={out}", *before]) == 0
+        before = [f"rig={out / rig_step.RIG}"]
+        found = read_rig(out / rig_step.RIG)
+        assert (found.version, str(found.identified.day)) == (version, "2026-05-04")
         (out / "mine.txt").write_text("of a person")
     rig, usual = read_rig(out / rig_step.RIG), read_rig()
     assert not [name for name in rig.measured if name.endswith(("dsnu_e", "prnu", "black_level_dn"))]
@@ -82,8 +89,11 @@ def test_what_is_no_capture_of_these_is_refused(capture, frames, tmp_path, capsy
     other.mkdir(parents=True)
     for name in "ab":
         cv2.imwrite(str(other / f"{name}.png"), np.zeros((8, 9), np.uint8))
+    own = shutil.copytree(capture, tmp_path / "own")
+    (own / "dark").mkdir()
     for given, told in (
         ([f"capture={tmp_path}"], "manifest.json"),
+        ([f"capture={own}"], "own/dark: expected a folder with images in cam1, found none"),
         ([f"capture={capture}", f"dark={few.parent}"], "expected two images or more of one thing, found 1"),
         ([f"capture={capture}", f"dark={other.parent}"], "expected 320x256"),
         ([f"capture={capture}", f"flat={tmp_path / 'nothing'}"], "expected a folder with images in cam1, found nothing"),

@@ -42,6 +42,14 @@ def test_a_board_and_a_target_are_written(place, capsys):
     assert sorted(path.name for path in (place / "sheets").iterdir()) == ["board.pdf", "target.pdf"]
 
 
+def test_the_protocol_is_a_page_and_refused_on_less_paper(place, capsys):
+    assert main(["print", "part=protocol", "paper=letter", "out=protocol.pdf"]) == 0
+    assert "6 steps, 20 minutes" in capsys.readouterr().out and (place / "protocol.pdf").is_file()
+    said = refusal(capsys, "part=protocol", "paper=[148,210]", "out=small.pdf")
+    assert said.startswith("paper: expected 210x279.4 mm or more, upright") and not (place / "small.pdf").exists()
+    assert "family: expected none with part=protocol, found 3" in refusal(capsys, "part=protocol", "family=3", "out=small.pdf")
+
+
 def test_a_board_too_large_is_refused_with_paper_and_lengths_that_fit(place, capsys):
     """And what the message offers fits: the smallest paper, and the largest squares to a tenth of a mm."""
     said = refusal(capsys, "part=board", WIDE, "out=board.pdf")

@@ -14,6 +14,7 @@ from rich.console import Console
 from recon.acquisition.guidance import Step
 from recon.acquisition.recording import open_recording
 from recon.acquisition.target_checks import target_places
+from recon.capture import calibration_files
 from recon.capture.board_part import read_board
 from recon.capture.manifest import Device, read_manifest
 from recon.capture.sweep_tables import read_stamps
@@ -21,11 +22,13 @@ from recon.devices.interfaces import DeviceError
 from recon.errors import InputError
 from recon.model.tracks import MAX_GAP_S
 from sonotwin import cli, config
+from sonotwin.choices import read_rig
 from sonotwin.open_devices import LiveDevices
 from sonotwin.terminal_operator import TerminalOperator
 from sonotwin.verbs import record
 from sonotwin.verbs.record import Config
-from tests.twin.small_rigs import half_as_fields
+from tests.twin.small_rigs import half, half_as_fields
+from twin.optics.surface_session import calibration_of
 
 QUIET = ("preview.serve=false", "tracing.samples=4")
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,0]", "path.speed_mm_s=20", "frames.quality.rim=2")
@@ -46,6 +49,35 @@ def test_a_recorded_surface_is_as_good_as_a_rendered_one(tmp_path, rig):
         assert cli.main(["evaluate", f"surface={tmp_path}/{name}-surface", f"truth={tmp_path}/made/truth"]) == 0
         rms[name] = json.loads((tmp_path / f"{name}-surface/evaluation/metrics.json").read_text())["surface_rms_mm"]
     assert rms["own"] == pytest.approx(rms["made"], rel=0.05)
+
+
+@pytest.mark.slow
+def test_frames_beside_a_recorded_surface_are_found_by_identify(tmp_path, rig):
+    """Black level, gain and PRNU within 5 standard deviations, of a camera of half the size; and a contrast at all.
+
+    Few rays a pixel put gamma and contrast off by more than they are said to be.
+    """
+    session = tmp_path / "session"
+    optics, small = tmp_path / "optics.yaml", half(rig)
+    calibration_files.write(optics, calibration_of(small))
+    quiet = ("scene=sphere", "cameras=[cam1]", "preview.serve=false", "tracing.samples=2", *half_as_fields(rig), f"out={session}")
+    surface = ("part=surface", "patterns=gray_surface", f"calibration={optics}")
+    for part in (surface, ("part=room",), ("part=dark",), ("part=flat",)):
+        assert cli.main(["record", *part, *quiet]) == 0
+    assert cli.main(["identify", f"capture={session}", *half_as_fields(rig), f"out={tmp_path / 'ours'}"]) == 0
+    found = read_rig(tmp_path / "ours/rig.yaml")
+    for name in ("cam1.sensor.black_level_dn", "cam1.sensor.saturation_e", "cam1.sensor.prnu"):
+        assert abs(found.number(name) - small.number(name)) < 5 * found.measured[name].sigma, name
+    assert "projector.contrast" in found.measured
+    assert found.identified.capture == "session"
+
+
+def test_frames_without_a_surface_are_refused(tmp_path, capsys):
+    """In one line, with nothing left."""
+    assert cli.main(["record", "part=dark", *QUIET, f"out={tmp_path / 'session'}"]) == 2
+    said = capsys.readouterr().err
+    assert "expected a surface or a board, as dark frames are exposed, found neither; record part=surface first" in said
+    assert said.count("\n") == 1 and not (tmp_path / "session").exists()
 
 
 @pytest.mark.slow

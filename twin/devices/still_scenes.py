@@ -22,6 +22,7 @@ from twin.optics.projected_image import ImageLight
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, is_convex, move_things, translucent
 from twin.optics.surface_session import CameraName, camera_optics
+from twin.sensor import electrons_per_radiance
 
 
 @dataclass
@@ -52,6 +53,22 @@ class StillScene:
         seed = int(np.random.SeedSequence([self.seed, CAMERAS.index(camera)]).generate_state(2)[0])
         soft = translucent(self.scene, self._world) if isinstance(light, Light) else ()  # images don't spread beneath skin
         return render(self._world, self._optics[camera], self._projector, light, self.tracing, seed, soft)
+
+
+@dataclass
+class EvenLight:
+    """Light that is nearly the same all over each camera's image, as of paper out of focus; none of covered lenses."""
+
+    rig: Rig
+    level: float  # of the charge that saturates a pixel, in 10 ms
+
+    def radiance(self, camera: CameraName, shown: Pattern) -> NDArray[np.float32]:
+        """What arrives at a camera's pixels : (h, w), W/mm^2/sr, a fifth less in one corner."""
+        device = getattr(self.rig, camera)
+        width, height = device.optics.size
+        slope = np.linspace(1.0, 0.9, width) * np.linspace(1.0, 0.9, height)[:, None]
+        electrons = electrons_per_radiance(device, self.rig.projector.wavelength_nm) * 0.01
+        return np.float32(slope * self.level * device.sensor.saturation_e / electrons)
 
 
 @dataclass

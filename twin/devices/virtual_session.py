@@ -1,7 +1,7 @@
 """Virtual devices of a recording, with what stands before them and the hand that moves it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,14 +15,16 @@ from recon.model.tracks import MAX_GAP_S
 from scenes.catalogue import build_scene
 from scenes.kinds import board
 from twin.devices.shown_light import Pattern
-from twin.devices.still_scenes import HeldBoard, StillScene, known_to_board, known_to_scene
+from twin.devices.still_scenes import EvenLight, HeldBoard, StillScene, known_to_board, known_to_scene
 from twin.devices.virtual_clock import Turns, VirtualClock
-from twin.devices.virtual_rig import VirtualCamera, VirtualProjector, VirtualRig
+from twin.devices.virtual_rig import Still, VirtualCamera, VirtualProjector, VirtualRig
 from twin.devices.virtual_sweep import VirtualPair, VirtualScanner
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import CameraName
 from twin.tracking.sampling_ranges import DataRanges
+
+COVERED = 1e9  # contrast of a projector behind a card
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,23 @@ def before_scene(settings: StillSettings, scene: Mapping[str, object], patterns:
     return _devices(settings, still, OneTake())
 
 
+def covered(settings: StillSettings) -> StillDevices:
+    """Devices whose lenses are covered."""
+    return _devices(settings, EvenLight(settings.rig, 0.0), OneTake())
+
+
+def before_paper(settings: StillSettings) -> StillDevices:
+    """Devices before white paper that is held near the lenses."""
+    return _devices(settings, EvenLight(settings.rig, 0.6), OneTake())
+
+
+def without_projector(settings: StillSettings, scene: Mapping[str, object]) -> StillDevices:
+    """Devices before a scene, and a black card before the projector; InputError if there is no such scene."""
+    dark = settings.rig.projector.model_copy(update={"contrast": COVERED})
+    rig = settings.rig.model_copy(update={"projector": dark})
+    return before_scene(replace(settings, rig=rig), scene, ())
+
+
 def before_board(settings: StillSettings, design: Board, patterns: Sequence[Pattern], count: int) -> StillDevices:
     """Devices before a hand that holds a board where it is asked to; InputError of one other than of dark, asymmetric circles."""
     if not isinstance(design, AsymmetricCircles) or design.white:
@@ -82,7 +101,7 @@ def during_sweep(settings: SweepSettings, ranges: DataRanges, paced: bool = Fals
     return SweepDevices(pairs, scanner, EachRest(turns, len(rests)) if shots else OneTake(lambda: pairs.over and scanner.over))
 
 
-def _devices(settings: StillSettings, still: StillScene | HeldBoard, operator: Operator) -> StillDevices:
+def _devices(settings: StillSettings, still: Still, operator: Operator) -> StillDevices:
     rig = VirtualRig(settings.rig, still, VirtualClock(settings.paced), settings.bits, settings.seed)
     return StillDevices({name: rig.camera(name) for name in settings.cameras}, rig.projector(), operator)
 
