@@ -82,7 +82,7 @@ def triangulation(
     ValueError
         If the calibration has no uncertainty.
     """
-    return _covariances(calibration, _point_slopes(calibration, first, second, points, pixel_sigma))
+    return _covariances(calibration, point_slopes(calibration, first, second, points, pixel_sigma))
 
 
 def parting(calibration: Calibration, points: Array, axes: Sequence[int] = (0,)) -> Array:
@@ -93,8 +93,8 @@ def parting(calibration: Calibration, points: Array, axes: Sequence[int] = (0,))
     axes : of the projector's coordinates that are decoded, 0 of columns and 1 of rows
     """
     decoded = np.where(np.isin([0, 1], axes), 1.0, np.inf)
-    by_light = _point_slopes(calibration, "cam1", "projector", points, (1.0, decoded))
-    return by_light - _point_slopes(calibration, "cam1", "cam2", points, (1.0, 1.0))
+    by_light = point_slopes(calibration, "cam1", "projector", points, (1.0, decoded))
+    return by_light - point_slopes(calibration, "cam1", "cam2", points, (1.0, 1.0))
 
 
 def shape(
@@ -113,7 +113,7 @@ def shape(
         Points that stand for the working volume, as from `working_volume`: the motion is fitted to these.
     """
     motion = _modes(calibration, first, second, volume, rigid_modes(volume), pixel_sigma)
-    slopes = _point_slopes(calibration, first, second, points, pixel_sigma)
+    slopes = point_slopes(calibration, first, second, points, pixel_sigma)
     return _covariances(calibration, slopes - rigid_modes(points) @ motion)
 
 
@@ -137,7 +137,7 @@ def mean_squares(calibration: Calibration, first: str, second: str, volume: Arra
     The trace of a form's product with any covariance of the same parameters is the mean over the volume of the summed variances
     of a point, mm^2: the first form's of `triangulation`, the second's of `shape`. The calibration's own covariance isn't used.
     """
-    slopes = _point_slopes(calibration, first, second, volume, (1.0, 1.0))
+    slopes = point_slopes(calibration, first, second, volume, (1.0, 1.0))
     within = slopes - rigid_modes(volume) @ _fit(rigid_modes(volume), slopes)
     forms = [np.einsum("kig,kih->gh", part, part) / len(volume) for part in (slopes, within)]
     return forms[0], forms[1]
@@ -208,10 +208,13 @@ def _covariances(calibration: Calibration, slopes: Array) -> Array:
     return propagate(slopes, _known(calibration).covariance)
 
 
-def _point_slopes(
+def point_slopes(
     calibration: Calibration, first: str, second: str, points: Array, pixel_sigma: tuple[ArrayLike, ArrayLike]
 ) -> Array:
-    """Derivatives of triangulated points by the parameters : (m, 3, g): `d(point) = -(A^T A)^-1 A^T B d(parameters)`."""
+    """Derivatives of triangulated points by the parameters : (m, 3, g): `d(point) = -(A^T A)^-1 A^T B d(parameters)`.
+
+    Points and weights are those of `triangulation`.
+    """
     pairs = [_slopes(calibration, device, points) for device in (first, second)]
     by_point, by_parameter = (
         np.concatenate([pair[k] / np.reshape(sigma, (-1, 1)) for pair, sigma in zip(pairs, pixel_sigma, strict=True)], axis=-2)
@@ -224,7 +227,7 @@ def _modes(
     calibration: Calibration, first: str, second: str, volume: Array, modes: Array, pixel_sigma: tuple[float, float]
 ) -> Array:
     """Shares of the modes : (k, 3, j) of a volume in the effect of each parameter : (j, g), by least squares."""
-    return _fit(modes, _point_slopes(calibration, first, second, volume, pixel_sigma))
+    return _fit(modes, point_slopes(calibration, first, second, volume, pixel_sigma))
 
 
 def _fit(modes: Array, slopes: Array) -> Array:

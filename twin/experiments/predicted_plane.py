@@ -1,8 +1,8 @@
 """The error of a plane that a rig will find, before anything is recorded, from its description; and what would lower it.
 
 At places all over the view: the light that comes back, the noise and the modulation of the finest fringes in it, the phase's
-error, and the plane's by the slope of the projector's column along the camera's ray. Errors of the calibration, and what is
-left of frames' errors after the decoder took them off, are not in it.
+error, and the plane's by the slope of the projector's column along the camera's ray; and what a calibration with covariance lets
+the plane bend. What is left of frames' errors after the decoder took them off is not in it.
 
 Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise.
 """
@@ -21,6 +21,7 @@ from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
 from recon.model.patterns import Fringes, Patterns
 from recon.model.rig import CameraDevice, ProjectorDevice, Rig
+from recon.optical_calibration import uncertainty as calibrated
 from scenes.kinds import plane
 from twin.experiments import closed_forms
 from twin.optics.light_transport import Tracing
@@ -50,6 +51,8 @@ class Prediction(NamedTuple):
     rms_mm: float
     noise_mm: float  # by the cameras' noise alone
     mirrors_mm: float  # by the projector's raster alone
+    optics_mm: float  # by errors of the calibration alone, as they are expected; 0 if the rig has no covariance
+    optics_sigma_mm2: float  # standard deviation of the square of that, from one calibration to the next
     modulation_dn: float  # median
     exposure_s: float
     common_view: float  # of camera 1's pixels, on a plane that is larger than its view
@@ -88,8 +91,18 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     by_mirrors = closed_forms.raster_sigma(rig, fringes, points)
     mm_a_rad = fringes.pitch / (2 * np.pi) * slopes
     noise_mm, mirrors_mm = (float(np.sqrt(np.mean((mm_a_rad * error) ** 2))) for error in (by_noise, by_mirrors))
+    bent2, bent2_sigma = _bent(rig, points, flat.normal)
     view = len(points) / (GRID[0] * GRID[1])
-    return Prediction(float(np.hypot(noise_mm, mirrors_mm)), noise_mm, mirrors_mm, float(np.median(modulation)), time_s, view)
+    return Prediction(
+        float(np.sqrt(noise_mm**2 + mirrors_mm**2 + bent2)),
+        noise_mm,
+        mirrors_mm,
+        float(np.sqrt(bent2)),
+        bent2_sigma,
+        float(np.median(modulation)),
+        time_s,
+        view,
+    )
 
 
 def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:
@@ -142,11 +155,32 @@ def _wave(rig: Rig, fringes: Fringes, points: Array) -> tuple[Array, Array, Arra
     return blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), peak
 
 
+def _bent(rig: Rig, points: Array, normal: Array) -> tuple[float, float]:
+    """Mean square, mm^2, of a plane's points : (n, 3) about the plane fitted to them, and its standard deviation.
+
+    By errors of the calibration, which are normal: of `z^T M z` with a covariance C, these are `tr(M C)` and
+    `sqrt(2 tr(M C M C))`.
+    """
+    calibration = rig.calibration()
+    if calibration.uncertainty is None:
+        return 0.0, 0.0
+    slopes = calibrated.point_slopes(calibration, "cam1", "projector", points, (1.0, (1.0, np.inf)))
+    along = np.einsum("i,nig->ng", normal, slopes)
+    plane_terms = np.column_stack([np.ones(len(points)), points[:, :2]])  # in z a plane's, as it stands before the camera
+    left = along - plane_terms @ np.linalg.lstsq(plane_terms, along)[0]
+    product = left.T @ left / len(points) @ calibration.uncertainty.covariance
+    return float(np.trace(product)), float(np.sqrt(2 * np.trace(product @ product)))
+
+
 def uncertainty(rig: Rig, measurement: Measurement) -> float:
-    """Standard deviation of the predicted RMS, mm, by those of the rig's measured numbers, which err independently."""
-    total = 0.0
+    """Standard deviation of the predicted RMS, mm, by those of the rig's measured numbers, which err independently.
+
+    Optics as calibrated err together: what they do to the plane differs from calibration to calibration.
+    """
+    now = predict(rig, measurement)
+    total = (now.optics_sigma_mm2 / (2 * now.rms_mm)) ** 2
     for name, known in rig.measured.items():
-        if known.sigma == 0:
+        if known.sigma == 0 or (rig.optics_covariance is not None and ".optics." in name):
             continue
         ends = [_changed(rig, name, side * SIGMAS * known.sigma) for side in (-1, 1)]
         way = ends[1].number(name) - ends[0].number(name)  # less at a bound

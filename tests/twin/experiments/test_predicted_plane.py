@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
+from recon.estimation import covariance as covariances
+from recon.identification import calibrated_optics as identified_optics
 from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
 from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.optical_calibration import uncertainty
+from scenes.board_poses import Config as Poses
 from scenes.kinds import plane
-from twin.experiments import drawn_rig, predicted_plane, surface_accuracy
+from twin.conditions import IDEAL
+from twin.experiments import chain_trial, closed_forms, drawn_rig, predicted_plane, surface_accuracy
+from twin.experiments.drawn_session import Noise, calibrated_optics
 from twin.experiments.predicted_plane import Measurement
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
@@ -70,6 +76,32 @@ def test_the_interval_is_that_of_the_measured_numbers(rig):
     now = predicted_plane.predict(rig, measurement(rig)).rms_mm
     assert predicted_plane.uncertainty(rig, measurement(rig)) == 0
     assert predicted_plane.uncertainty(one, measurement(rig)) == pytest.approx(0.025 * now, rel=0.1)
+
+
+def test_a_calibrations_errors_bend_the_plane_as_predicted(rig, rng):
+    """Mean square and scatter of 300 calibrations with errors drawn from the covariance of one by a board in 12 poses."""
+    calibration = calibrated_optics(rig, IDEAL, Noise(board_px=0.05), Poses(count=12), 3)
+    known = identified_optics.with_devices(rig, calibration)
+    found, (camera, projector) = predicted_plane.predict(known, measurement(known)), known_devices(known.calibration())
+    true = plane.build(plane.PAPER_POSES[2]).shapes[0]
+    pixels = (
+        np.stack(np.meshgrid((np.arange(17) + 0.5) / 17 * 1280, (np.arange(13) + 0.5) / 13 * 1024), axis=-1).reshape(-1, 2) - 0.5
+    )
+    points, _ = closed_forms.seen_points(camera, projector, true, pixels)
+    seen, columns = camera.project(points), projector.project(points)[:, 0]
+    terms = np.column_stack([np.ones(len(points)), points[:, :2]])
+    root, squares = covariances.root(known.calibration().uncertainty.covariance), []
+    for _ in range(300):
+        moved = known_devices(uncertainty.apply(known.calibration(), root @ rng.standard_normal(root.shape[1])))
+        off = (chain_trial.on_rays(moved, moved[0].rays(seen), columns, points) - points) @ true.normal
+        squares.append(np.mean((off - terms @ np.linalg.lstsq(terms, off)[0]) ** 2))
+    assert np.mean(squares) == pytest.approx(found.optics_mm**2, rel=0.2)
+    assert np.std(squares) == pytest.approx(found.optics_sigma_mm2, rel=0.3)
+    assert found.rms_mm == pytest.approx(np.linalg.norm([found.noise_mm, found.mirrors_mm, found.optics_mm]))
+
+
+def known_devices(calibration):
+    return [calibration.cameras[name] for name in ("cam1", "projector")]
 
 
 def test_a_plate_out_of_view_is_refused(rig):
