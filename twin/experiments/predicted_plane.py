@@ -71,7 +71,7 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     points, slopes = _seen(rig, flat, measurement.plate)
     radiance = _radiance(rig, points, flat.normal, measurement.plate.reflectance)
     room = measurement.plate.reflectance * measurement.tracing.room_radiance * _passed(rig.cam1, points)
-    mean, amplitude, peak = _wave(rig, fringes, points)
+    mean, amplitude, second, peak = _wave(rig, fringes, points)
     if any(not isinstance(part, Fringes) for part in measurement.patterns.parts):
         peak = np.ones_like(mean)  # a code's stripes, or a uniform image
     electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
@@ -84,9 +84,10 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
         raise ValueError(f"shooting.exposure_s: {expected}, found {1e3 * time_s:.3g} ms")
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
     per_electron = number_per_electron(sensor, exposure)
-    mean_e = (radiance * mean + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
+    weighed = mean - second / 2  # light at the steps by which the phase is known, where the wave is steep: weights are sin^2
+    counted_e = (radiance * weighed + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
     modulation = radiance * amplitude * electron * time_s * per_electron
-    noise = noise_dn(np.float32(mean_e), sensor, exposure)
+    noise = noise_dn(np.float32(counted_e), sensor, exposure)
     by_noise = np.sqrt(2 / fringes.steps) * noise / modulation
     by_mirrors = closed_forms.raster_sigma(rig, fringes, points)
     mm_a_rad = fringes.pitch / (2 * np.pi) * slopes
@@ -146,13 +147,13 @@ def _corner2(device: CameraDevice | ProjectorDevice, points: Array) -> Array:
     return ((camera.project(points) - middle) ** 2).sum(axis=1) / (middle @ middle)
 
 
-def _wave(rig: Rig, fringes: Fringes, points: Array) -> tuple[Array, Array, Array]:
-    """Mean, first harmonic's amplitude and peak : (n,) of the fringes' light at points with all blur, 1 for a pixel fully on."""
+def _wave(rig: Rig, fringes: Fringes, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Mean, amplitudes of two harmonics, and peak : (n,) of fringes' light at points with all blur, 1 for a pixel fully on."""
     harmonics = np.fft.rfft(closed_forms.waveform(rig, fringes, WAVE)) / WAVE
     waves = np.arange(len(harmonics)) / fringes.pitch
     blurred = harmonics * np.sinc(waves) * closed_forms.transfer(rig, points, waves)
     peak = np.fft.irfft(blurred * WAVE, axis=-1).max(axis=-1)
-    return blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), peak
+    return blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), 2 * blurred[:, 2].real, peak
 
 
 def _bent(rig: Rig, points: Array, normal: Array) -> tuple[float, float]:
