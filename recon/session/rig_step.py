@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime
 from pathlib import Path
@@ -32,7 +33,7 @@ from recon.model.patterns import Fringes
 from recon.model.rig import Rig
 from recon.optical_calibration.joint_calibration import Result
 from recon.registry import Choice
-from recon.session import optics_step
+from recon.session import hand_step, optics_step
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import phase
 from recon.structured_light.decode import decode
@@ -71,7 +72,7 @@ class Settings(Part):
     """Sources, and what is read off data sheets."""
 
     capture: Path
-    """a capture folder with a board, a surface under fringes, or both"""
+    """a capture folder with a board, a surface under fringes, or both, or films"""
     rig: Annotated[Rig, Choice("meza2021")]
     """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
     day: date | None = None
@@ -89,6 +90,12 @@ class Settings(Part):
     """linear, of the cameras: 1 fills the range with the sensor's saturation charge; null: as the capture has it, else 1"""
     adc_bits: Annotated[int | None, Field(ge=8, le=16)] = None
     """of both cameras' converters, by the data sheet, if at hand; else as of `rig`, with a doubt"""
+    still: tuple[str, ...] = ()
+    """names of the capture's sweeps with frames of both cameras and the target in a stand: the tracker's noise"""
+    hand: tuple[str, ...] = ()
+    """the same with the target or the probe in a hand, 27 frames a second or more for its tremor"""
+    probes: tuple[Path, ...] = ()
+    """files that calibrate-probe wrote before and after a session, and so on of further ones: the bracket's giving"""
 
 
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
@@ -97,9 +104,9 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, holds neither a board nor fringes, or `out` can't be written to.
+        If the capture is incomplete or damaged, holds neither a board nor fringes nor named films, or `out` can't be written to.
     """
-    inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room)
+    inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes)
     atomic.check_folder(out, BY, inputs=inputs)
     rig, found = identify(settings, watch)
     for line in describe(found):
@@ -129,7 +136,9 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
     """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
     manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
     if manifest.board is None and manifest.surface is None:
-        raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
+        if not (settings.still or settings.hand):
+            raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
+        return settings.rig, Findings(unknown=NOT_SEEN) | _films(settings, None, watch)
     part: PartName = "board" if manifest.surface is None else "surface"
     frames = {
         camera: _frames(settings, camera, device) for camera, device in manifest.devices_of(part).items() if camera in CAMERAS
@@ -155,6 +164,7 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
     if CAMERAS[0] in shots:
         with watch.busy("measuring the projector"):
             found |= _projector(CAMERAS[0], shots[CAMERAS[0]], rig, found, frames[CAMERAS[0]].room)
+    found |= _films(settings, None if board is None else calibration, watch)
     if settings.adc_bits is not None:
         sensors_of = {camera: getattr(rig, camera).sensor.model_copy(update={"adc_bits": settings.adc_bits}) for camera in frames}
         rig = rig.model_copy(
@@ -192,13 +202,28 @@ def _shots(settings: Settings, manifest: Manifest, calibration: Calibration | No
     """Fringes before each camera that took them, by a new calibration, if there is one."""
     if manifest.surface is None:
         return {}
-    with TemporaryDirectory() as folder:
-        file = settings.calibration
-        if calibration is not None:
-            file = Path(folder) / "optics.yaml"
-            calibration_files.write(file, calibration)
+    with _file_of(calibration, settings) as file:
         cameras = [name for name in CAMERAS if name in manifest.surface.images]
         return {camera: surface_part.read_surface(settings.capture, camera, file) for camera in cameras}
+
+
+@contextmanager
+def _file_of(calibration: Calibration | None, settings: Settings) -> Iterator[Path | None]:
+    """A new calibration as a file; without one, the file given, if there is one."""
+    if calibration is None:
+        yield settings.calibration
+        return
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "optics.yaml"
+        calibration_files.write(file, calibration)
+        yield file
+
+
+def _films(settings: Settings, calibration: Calibration | None, watch: Watch) -> Findings:
+    """The tracker, the hand and the bracket; by a new calibration, if there is one."""
+    with _file_of(calibration, settings) as file:
+        found = hand_step.identify(settings.capture, settings.rig, file, settings.still, settings.hand, watch)
+    return found | hand_step.compare_probes(settings.probes)
 
 
 def _sensor(camera: str, settings: Settings, frames: _Frames, shot: SurfaceCapture | None) -> Findings:
