@@ -128,6 +128,7 @@ COMMANDS = (
             ("both/capture/manifest.json", "both/capture/surface/cam2/0003.png", "both/capture/calibration/optics.yaml")),
     Command("identify", ("capture=board/capture", "dark=covered"), ("board", "covered"),
             ("board/capture/manifest.json", "board/capture/board/01/cam1/0003.png", "covered/cam1/0003.png")),
+    Command("compare-twin", ("capture=ball/capture", "tracing.samples=2"), ("ball",), BALL[:2]),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),

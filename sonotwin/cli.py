@@ -67,6 +67,7 @@ VERBS = (  # in the order in which a person meets them
     Verb("import-sweep", "read a scanner's clip and a tracker's poses into a capture"),
     Verb("export", "write a capture in another group's layout"),
     Verb("evaluate", "compare a surface with a rendered capture's ground truth"),
+    Verb("compare-twin", "render a real capture again with its identified rig, and say what the twin doesn't explain"),
     Verb("predict", "predict a rig's error on a plane before anything is recorded, and what would lower it"),
     Verb("accuracy", "measure errors of the twin's rig and compare with the paper's figures"),
     Verb("study", "repeat an experiment over settings and seeds: tables, plots, limits"),

@@ -39,6 +39,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "calibrate-optics": {"optics.yaml"},
     "calibrate-target": {"target.yaml"},
     "identify": {"", "rig.yaml", "conditions.yaml"},
+    "compare-twin": {"", "report.html"},
     "calibrate-tip": {"tip.yaml"},
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},

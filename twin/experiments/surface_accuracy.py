@@ -21,6 +21,7 @@ from scenes.kinds import plane
 from scenes.scene_types import Scene
 from twin.conditions import IDEAL, Conditions
 from twin.evaluation import surface_errors
+from twin.evaluation.local_residuals import smooth_noise_ratio
 from twin.evaluation.surface_errors import Comparison, Metrics, Truth
 from twin.experiments.experiment_setup import Figures, Setup
 from twin.optics.light_transport import Tracing
@@ -31,7 +32,6 @@ TRACING, SHOOTING = Tracing(samples=16, room_lux=20), Shooting()
 REAL_DEPTH_MM = (690.0, 780.0)
 CAMERAS: tuple[CameraName, ...] = ("cam1", "cam2")
 EVERY, NEAR_MM = 7, 0.5  # of the true points one is looked at; from the surface, within which it has that point
-WINDOW = 9  # px; patches of the real surface in which noise is told from shape by a quadratic fit
 
 
 @dataclass(frozen=True)
@@ -178,29 +178,3 @@ def relief(setup: Setup) -> tuple[PointMap, NDArray[np.float64]]:
     camera, projector = optics["cam1"], optics["projector"]
     found = decode(read_images(paths, camera.size, 8), patterns, name=folder.name)
     return clean(triangulate(found, camera, projector), camera, found.modulation), camera.centre
-
-
-def smooth_noise_ratio(distance: NDArray[np.float32], sigma: NDArray[np.float32], smoothest: float = 0.25) -> float:
-    """Noise of neighbouring points over their predicted sigma, the median over smooth patches.
-
-    In each WINDOW x WINDOW patch without gaps a quadratic takes the shape away; what is left, for the degrees of freedom that
-    are left, is noise. Smooth are the patches where the quadratic's curvature is among the `smoothest` share: chosen by shape,
-    not by residual.
-    """
-    v, u = np.mgrid[:WINDOW, :WINDOW] - WINDOW // 2
-    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(-1, 6).astype(float)
-    patches = patches_of(distance), patches_of(sigma)
-    whole = np.isfinite(patches[0]).all(axis=1)
-    heights, sigmas = (patch[whole].astype(float) for patch in patches)
-    shape, *_ = np.linalg.lstsq(design, heights.T, rcond=None)
-    noise = np.sqrt(((heights.T - design @ shape) ** 2).sum(axis=0) / (len(design) - 6))
-    curvature = np.abs(shape[3:]).sum(axis=0)
-    smooth = curvature <= np.quantile(curvature, smoothest)
-    return float(np.median(noise[smooth] / np.sqrt((sigmas[smooth] ** 2).mean(axis=1))))
-
-
-def patches_of(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Patches side by side : (n, WINDOW * WINDOW)."""
-    height, width = (length // WINDOW * WINDOW for length in image.shape)
-    blocks = image[:height, :width].reshape(height // WINDOW, WINDOW, width // WINDOW, WINDOW)
-    return blocks.transpose(0, 2, 1, 3).reshape(-1, WINDOW * WINDOW)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from recon.capture.surface_part import read_patterns
@@ -68,20 +67,3 @@ def test_real_relief(setup, real):
 def test_round_trip(lens):
     """Pixel to ray to pixel through all 14 coefficients, everywhere in the image."""
     check(optics_accuracy.round_trip, None, lens=lens)
-
-
-@pytest.mark.parametrize("told", [1.0, 0.5])
-def test_noise_is_told_from_shape(rng, told):
-    """On a curved surface with known noise the ratio is that of the noise to what sigma claims (3 %)."""
-    v, u = np.mgrid[:300, :400]
-    distance = np.float32(650 + 2e-4 * (u - 200) ** 2 + 1e-4 * u * v + rng.normal(0, 0.05, u.shape))
-    ratio = surface_accuracy.smooth_noise_ratio(distance, np.full(u.shape, 0.05 * told, np.float32))
-    assert ratio == pytest.approx(1 / told, rel=0.03)
-
-
-def test_gaps_are_left_out(rng):
-    """Patches with a hole don't count, whatever is in the hole's place."""
-    distance = np.float32(650 + rng.normal(0, 0.05, (90, 90)))
-    distance[10, 10] = np.nan
-    ratio = surface_accuracy.smooth_noise_ratio(distance, np.full(distance.shape, 0.05, np.float32))
-    assert ratio == pytest.approx(1, rel=0.1)
