@@ -26,6 +26,7 @@ from recon.identification.estimates import Estimate, Findings
 from recon.identification.frame_scatter import NINETY_FIVE, Scatter, scatter
 from recon.identification.projected_light import Footprint, mirror_weights
 from recon.model.patterns import Axis, Fringes, Patterns, Uniform
+from recon.model.rig import ProjectorDevice
 from recon.structured_light.decode import ProjectorMap, Status
 from recon.structured_light.phase import Noise
 from recon.structured_light.triangulate import PointMap
@@ -44,6 +45,11 @@ FRAMES = np.array([0.02, 1.0, 0.05])  # standard deviations of gains, offsets in
 MOST_FRAMES = np.array([0.2, 20.0, 0.2])
 LEAST_FRAMES = np.array([1e-5, 1e-3, 1e-5])
 LENS = [BLUR, APERTURE, VERGENCE]
+SEEN = (
+    "surface.projector_blur_px",
+    "surface.projector_point_spread_px",
+    "surface.depth_mm",
+)  # the whole blur, a part of it, where
 LENS_ERROR = 1.25  # of their standard deviations: 25 renders of a plane, a sphere and a breast left z-scores of 1.1 to 1.4
 LEAST_BLUR_ERROR_PX = 0.01  # the mean error in the same renders, most on the sphere: a pixel's view of what is bent
 LOOSE = 5.0  # standard deviations of the decoded coordinate, of a prior around it: it costs a 25th of its information
@@ -53,7 +59,7 @@ LONGEST_PX = 0.3  # step of a coordinate
 CLEAR = 3.0  # standard deviations of noise, from which on nothing is clipped
 BLIND = 1e-9  # of the best known direction: one that is known less is one that the images can not show
 SHIFTS = 2  # among gains, offsets and shifts
-FAITHFUL = 1.5  # times the noise, which residuals of a faithful model reach at most
+FAITHFUL = 1.2  # times the noise, which residuals of a faithful model reach at most
 FRINGES = 8  # images, that show frames' errors by themselves
 FEW = 1000  # pixels of a search
 COARSE, FINE = Rules(damping=1e-2, converged=1e-5, steps=25), Rules(converged=1e-7, steps=8)
@@ -80,6 +86,7 @@ class Selection:
     blur_px: float = 0.1  # lenses blur by 0.3 to 0.8 px
     aperture: float = 0.12  # relative; projectors' lenses are of f/1.7 to f/2.8
     vergence_per_m: float = 0.12  # 50 mm at 650 mm
+    total: float = 0.1  # relative, of the whole blur where its parts aren't known
     margin: float = 12.0  # of the cost, by which a focus in front of the surface must differ from one behind it
     modes: float = 3.0  # errors of frames, of which a standard deviation can be taken,
     frames: tuple[float, float, float] = (0.005, 0.3, 0.02)  # or else least sigmas of flicker, stray light in DN, shift in steps
@@ -690,7 +697,8 @@ def _total(pixels: Pixels, shared: Array, covariance: Array) -> Estimate:
     slope[BLUR] = 2 * shared[BLUR]
     slope[APERTURE] = np.mean(aperture * (magnification * off) ** 2 / 8)
     slope[VERGENCE] = np.mean((aperture * magnification) ** 2 * off / 8)
-    return Estimate(np.sqrt(total), float(np.sqrt(slope @ covariance @ slope) / (2 * np.sqrt(total))), "the fit")
+    sigma = np.sqrt(max(slope @ covariance @ slope, 0.0) / total) / 2 if total else np.inf
+    return Estimate(float(np.sqrt(total)), float(sigma), "the fit")
 
 
 def _margin(model: Model, few: NDArray, state: State, other: State) -> float:
@@ -734,6 +742,9 @@ def findings(response: Response, patterns: Patterns, focal_length_mm: float, sel
             "a surface with more depth parts them"
         )
         unknown |= {f"projector.lens.{name}": why for name in ("blur_px", "f_number", "focus_mm")}
+        if total.sigma < selection.total * total.value:
+            part = Estimate(float(min(shared[BLUR], total.value)), float(sigma[BLUR]), source)
+            estimates |= dict(zip(SEEN, (total, part, Estimate(response.depth_mm, 0.0, source)), strict=True))
     scatters = {"flicker": response.flicker, "stray_dn": response.stray, "shift": response.shift}
     for (name, one), usual in zip(scatters.items(), selection.frames, strict=True):
         if one.modes > selection.modes or one.sigma < usual:
@@ -741,6 +752,20 @@ def findings(response: Response, patterns: Patterns, focal_length_mm: float, sel
         else:
             unknown[f"conditions.frames.{name}"] = f"its standard deviation is {one.sigma:.2g}: too few frames show it"
     return Findings(estimates, unknown)
+
+
+def with_blur_as_seen(device: ProjectorDevice, found: Findings) -> ProjectorDevice:
+    """A projector whose lens isn't measured, but its whole blur at a surface, so that it blurs as much there.
+
+    It is taken as focused nearer than the surface, with its aperture as it is assumed; no images tell.
+    """
+    if not found.estimates.keys() >= set(SEEN):
+        return device
+    lens, (total, part, depth) = device.lens, (found.estimates[name].value for name in SEEN)
+    disc = 4 * np.sqrt(max(total**2 - part**2, 0.0))
+    nearer = disc / (device.optics.focal_px[0] * lens.aperture_mm)
+    focused = {"blur_px": part, "focus_mm": float(1 / (1 / depth + nearer))}
+    return device.model_copy(update={"lens": lens.model_copy(update=focused)})
 
 
 def contrast(response: Response, room: NDArray | None, *, bits: int = 8) -> Findings:

@@ -42,7 +42,7 @@ from recon.structured_light.triangulate import triangulate
 BY = "identify"  # who writes
 RIG, CONDITIONS, FIGURES = "rig.yaml", "conditions.yaml", "identified.json"
 CAMERAS = ("cam1", "cam2")
-BLUR_SIGMA_PX = 0.15  # of a camera's point spread where no board showed it
+BLUR_SIGMA_PX = 0.15, 0.5  # of a camera's point spread where no board showed it, and with its defocus where none showed this
 BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
 
 LENS = ("f_number", "focus_mm", "blur_px", "vignetting")
@@ -170,6 +170,7 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
         rig = rig.model_copy(
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
+    rig = rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)})
     return rig_file.apply(rig, found), found
 
 
@@ -304,32 +305,26 @@ def _agreed(first: Mapping[str, Estimate], second: Mapping[str, Estimate]) -> di
 
 
 def _projector(camera: str, shot: SurfaceCapture, rig: Rig, found: Findings, room: Images | None) -> Findings:
-    """The projector's light, as the camera saw it; nothing of its lens if the camera's isn't measured, whose blur looks alike."""
+    """The projector's light, as the camera saw it."""
     devices = shot.calibration.cameras[camera], shot.calibration.cameras["projector"]
     length = rig.projector.lens.focal_length_mm
     try:
         decoded = decode(shot.images, shot.patterns, bits=shot.bits, name=shot.name, camera=camera)
         points = triangulate(decoded, *devices)
-        seen = projector.identify(
+        return projector.identify(
             shot.images, shot.patterns, decoded, points, devices, length, _blur(camera, rig, found), bits=shot.bits, room=room
         )
     except InputError as error:
         return Findings(unknown={name: str(error) for name in NOT_SEEN if name.startswith(("projector.", "conditions."))})
-    if f"{camera}.lens.focus_mm" in found.estimates:
-        return seen
-    names = [f"projector.lens.{name}" for name in ("blur_px", "f_number", "focus_mm")]
-    why = f"needs the blur of {camera}, which a board of discs shows"
-    estimates = {name: one for name, one in seen.estimates.items() if name not in names}
-    return Findings(estimates, seen.unknown | dict.fromkeys(names, why))
 
 
 def _blur(camera: str, rig: Rig, found: Findings) -> CameraBlur:
-    """A camera's blur as measured, or as the rig has it."""
+    """A camera's blur as measured, or a point spread as the rig has it."""
     lens, known = getattr(rig, camera).lens, found.estimates
-    point = known.get(f"{camera}.lens.blur_px", Estimate(lens.blur_px, BLUR_SIGMA_PX, "assumed"))
     names = [f"{camera}.lens.{name}" for name in ("f_number", "focus_mm")]
     if not all(name in known for name in names):
-        return CameraBlur(point.value, point.sigma, lens.aperture_mm, lens.focus_mm)
+        return CameraBlur(lens.blur_px, BLUR_SIGMA_PX[1])
+    point = known.get(f"{camera}.lens.blur_px", Estimate(lens.blur_px, BLUR_SIGMA_PX[0], "assumed"))
     number, focus = (known[name].value for name in names)
     return CameraBlur(point.value, point.sigma, lens.focal_length_mm / number, focus)
 

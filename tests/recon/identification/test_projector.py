@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.identification import projector
-from recon.identification.estimates import Findings
+from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur, Selection
 from recon.structured_light.decode import decode
 from sonotwin.choices import read_patterns
@@ -61,3 +61,17 @@ def test_three_pitches_show_the_same(rig, rng):
     assert {"projector.gamma", "conditions.frames.flicker"} <= found.estimates.keys()
     for name, one in found.estimates.items():
         assert abs(one.value - truth[name]) < 3.5 * one.sigma, name
+
+
+@pytest.mark.parametrize(("total", "part"), [(3.0, 0.5), (12.5, 12.4), (0.3, 0.3)])
+def test_a_lens_that_is_not_measured_blurs_as_is_seen(rig, total, part):
+    """Point spread and disc together, at the depth where they were seen; one that is measured stays."""
+    depth = 700.0
+    seen = Findings(
+        {name: Estimate(value, 0.1, "a test") for name, value in zip(projector.SEEN, (total, part, depth), strict=True)}
+    )
+    lens, focal_px = projector.with_blur_as_seen(rig.projector, seen).lens, rig.projector.optics.focal_px[0]
+    disc = focal_px * lens.aperture_mm * abs(1 / depth - 1 / lens.focus_mm)
+    assert np.hypot(lens.blur_px, disc / 4) == pytest.approx(total) and lens.f_number == rig.projector.lens.f_number
+    assert lens.focus_mm <= depth + 1e-9
+    assert projector.with_blur_as_seen(rig.projector, Findings()) == rig.projector
