@@ -10,7 +10,8 @@ What shows what; all lengths across the depth are in wavelengths:
 - a tank's bottom: its repeats are R x `face_reflection` apart, but clip as the bottom does, and R is of the bottom
 
 All of it rests on raw speckle. Behind a scanner that compounds or smooths, or whose grey map is bent, numbers would be off by up
-to 30 standard deviations: they are named as unknown. Unsharp masks, which scale contrast alone, look like another dynamic range.
+to 30 standard deviations: they are named as unknown, and grains measured as displayed. Unsharp masks, which scale contrast alone,
+look like another dynamic range.
 
 A detected image holds no carrier: the frequency is read off the probe, and its uncertainty goes into all that is known in
 wavelengths. The tissue's attenuation and echo are those of the phantom's sheet.
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from recon.identification import grey_map, sound_beam, speckle
+from recon.identification import displayed_speckle, grey_map, sound_beam, speckle
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.grey_map import Levels, few
 from recon.identification.sound_beam import Across, Along
@@ -134,7 +135,10 @@ def identify(recordings: Recordings, sheet: Sheet, settings: Settings = USUAL) -
         share = _share(levels, noise, settings)
         placed = recordings.steps, recordings.steps_world_from_image, recordings.steps_sigma
         found |= across(*placed, sheet, share, found, settings)
-    return found if raw else _as_if_raw(found)
+    if raw:
+        return found
+    first = int(settings.face_mm / sheet.mm_per_px[1])
+    return _as_if_raw(found) | displayed_speckle.summary(recordings.tissue[:, first:], sheet.mm_per_px)
 
 
 def _as_if_raw(found: Findings) -> Findings:

@@ -18,11 +18,6 @@ from twin.ultrasound.transducer import Transducer
 
 __all__ = ["optics"]  # a fixture
 
-EVEN = (  # gelatin without inclusions
-    "scene=test_object",
-    "scene.size_mm=[80,160,60]",
-    *(f"scene.{name}=[]" for name in ("filament_depths_mm", "row_x_mm", "cysts", "bright", "dark")),
-)
 NARROW = tuple(f"{part}.image_size=[112,408]" for part in ("rig.probe", "ultrasound"))
 
 
@@ -151,9 +146,9 @@ def test_what_shows_no_scanner_is_refused(sweeps, capture, tmp_path, capsys):
 def test_a_rendered_phantom_gives_a_scanner_for_other_verbs(tmp_path, capsys):
     """Sweeps alone, over gelatin and in air: no number is off by more than 4 standard deviations; and a sweep by the result."""
     out, hz = tmp_path / "rendered", "clocks.scanner_hz"
-    stroke = [*EVEN, "path.start_mm=[4,-68]", "path.end_mm=[4,48]", "path.speed_mm_s=20", f"{hz}=2"]
+    stroke = ["scene=gelatin", "path.start_mm=[4,-68]", "path.end_mm=[4,48]", "path.speed_mm_s=20", f"{hz}=2"]
     slide = [
-        *EVEN,
+        "scene=gelatin",
         "path.start_mm=[4,58]",
         "path.end_mm=[4,62]",
         "path.speed_mm_s=2",
