@@ -61,7 +61,9 @@ class Recordings:
     air: Images | None = None  # of the probe in air
     steps: Images | None = None  # of even tissue, a fraction of the slice apart
     steps_world_from_image: Array | None = None  # (n, 4, 4) mm, their poses
-    steps_sigma: float = 0.0  # relative error of their distances
+    steps_errors_mm: Array | None = (
+        None  # (q, n) of their places across the plane: q independent errors of one standard deviation
+    )
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ def identify(recordings: Recordings, sheet: Sheet, settings: Settings = USUAL) -
         found |= face_ring(recordings.air, sheet, levels, settings)
     if recordings.steps is not None and recordings.steps_world_from_image is not None:
         share = _share(levels, noise, settings)
-        placed = recordings.steps, recordings.steps_world_from_image, recordings.steps_sigma
+        placed = recordings.steps, recordings.steps_world_from_image, recordings.steps_errors_mm
         found |= across(*placed, sheet, share, found, settings)
     if raw:
         return found
@@ -501,7 +503,7 @@ def face_ring(images: Images, sheet: Sheet, levels: Levels, settings: Settings =
 def across(
     images: Images,
     world_from_image: Array,
-    steps_sigma: float,
+    errors_mm: Array | None,
     sheet: Sheet,
     share: Callable[[Array], Array],
     found: Findings,
@@ -512,7 +514,7 @@ def across(
     Parameters
     ----------
     world_from_image : (n, 4, 4) mm, of B-scans : (n, h, w) that are parallel, side by side
-    steps_sigma : relative error of their distances
+    errors_mm : (q, n) of their places, as of `Recordings`
     found : with the bandwidth, if that is known
     """
     names = ("elevation_mm", "elevation_focus_mm")
@@ -526,10 +528,11 @@ def across(
     rows = speckle.bands(images.shape[1], sheet.mm_per_px[1], settings.face_mm, settings.grain_band_mm)
     rows = [band for band in rows if ((images[:, band] == 0) | (images[:, band] == 255)).mean() < speckle.CLIPPED]
     steps, grey, without = speckle.across(images, local[:, 2], sheet.mm_per_px, rows)
+    shifts = _lag_errors(local[:, 2], np.zeros((0, len(images))) if errors_mm is None else errors_mm)
     near = (steps > 0.02) & (steps < REACH_MM)
     if near.sum() < 3 or len(rows) < 3 or not (grey[:, near] > 0.1).any():
         return Findings(unknown={f"ultrasound.{name}": "no two B-scans show the same grains" for name in names})
-    depth, steps = _middles(rows, sheet.mm_per_px[1]), steps[near]
+    depth, steps, shifts = _middles(rows, sheet.mm_per_px[1]), steps[near], shifts[:, near]
     known, f = share(depth), sheet.frequency_mhz
     end = sheet.mm_per_px[1] * (images.shape[1] - 1)
     ends = [
@@ -540,13 +543,11 @@ def across(
     def correlations(theta: Array, told: Array) -> Array:
         slab = Across(1e-3 * sheet.assumed_speed / float(np.exp(told[0])), *np.exp(theta))
         return known[:, None] * np.array(
-            [sound_beam.alike_across(slab, each, steps * np.exp(told[1]), own) for each, own in zip(depth, band, strict=True)]
+            [sound_beam.alike_across(slab, each, steps + told[1:] @ shifts, own) for each, own in zip(depth, band, strict=True)]
         )
 
-    prior, given = (
-        np.array([LIKELY[name] for name in names]),
-        np.array([(np.log(f.value), f.sigma / f.value), (0.0, steps_sigma)]),
-    )
+    prior = np.array([LIKELY[name] for name in names])
+    given = np.array([(np.log(f.value), f.sigma / f.value), *[(0.0, 1.0)] * len(shifts)])
     starts = [np.log([height, focus]) for height in (3.3, 4.6, 6.5) for focus in (12.0, 16.0, 21.0, 28.0)]
     fit = _adjusted(correlations, grey[:, near], without[..., near], prior, given, starts, by_band=True)
     estimates, unknown = {}, {}
@@ -558,6 +559,14 @@ def across(
             source = f"grains of {len(images)} B-scans side by side, and the frequency"
             estimates[f"ultrasound.{name}"] = Estimate(value, value * float(np.hypot(sigma, settings.beam)), source)
     return Findings(estimates, unknown)
+
+
+def _lag_errors(places_mm: Array, errors_mm: Array) -> Array:
+    """Errors : (q, s) mm of the distances of `speckle.lags`, each the mean over its pairs, by q errors of the places : (q, n)."""
+    distinct, first, second, pair = speckle.lags(places_mm)
+    longer = np.sign(places_mm[second] - places_mm[first]) * (errors_mm[:, second] - errors_mm[:, first])
+    count = np.bincount(pair, minlength=len(distinct))
+    return np.array([np.bincount(pair, each, len(distinct)) / count for each in longer]).reshape(len(errors_mm), len(distinct))
 
 
 def dark_columns(images: Images, sigmas: float = 6.0) -> Mapping[int, Estimate]:

@@ -131,8 +131,8 @@ def identify(settings: Fields, capture: Path, manifest: Manifest, rig: Rig, watc
         if isinstance(placed, str):
             found |= Findings(unknown=dict.fromkeys((f"{GROUP}elevation_mm", f"{GROUP}elevation_focus_mm"), placed))
         else:
-            which, poses, sigma = placed
-            stepped = _images([recordings["steps"].paths[k] for k in which], clip), poses, sigma
+            which, at = placed
+            stepped = _images([recordings["steps"].paths[k] for k in which], clip), at.poses, at.errors_mm
     else:
         why = "no B-scans of even tissue side by side"
         found |= Findings(unknown=dict.fromkeys((f"{GROUP}elevation_mm", f"{GROUP}elevation_focus_mm"), why))
@@ -289,57 +289,66 @@ def _check_tissue(settings: Fields, images: Mapping[str, Images], sheet: Sheet) 
             raise InputError(f"tissue: expected B-scans brighter than those in air, found {found}: no contact?")
 
 
+class Placed(NamedTuple):
+    """Places of n B-scans from a probe on a slide."""
+
+    poses: Array  # (n, 4, 4) mm, in the frame of the middle one
+    errors_mm: Array  # (q, n) of the places across the plane: q independent errors of one standard deviation
+
+
 def _placed(
     settings: Fields, recording: _Recording, capture: Path, calibration: ProbeCalibration | None
-) -> tuple[NDArray[np.int64], Array, float] | str:
-    """Numbers of B-scans side by side, their poses : (n, 4, 4) mm, and the relative error of their distances; else a reason."""
+) -> tuple[NDArray[np.int64], Placed] | str:
+    """Numbers of B-scans side by side, and their places; else a reason."""
     count = len(recording.paths)
     if settings.step_mm is not None:
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, 2, 3] = settings.step_mm * np.arange(count)
-        which = beside(poses)
-        return which, poses[which], STEP_SIGMA
-    if recording.sweep is None:
+        which, placed = np.arange(count), Placed(poses, STEP_SIGMA * poses[None, :, 2, 3])
+    elif recording.sweep is None:
         raise InputError("step_mm: expected mm from one B-scan to the next with a folder of steps, found none")
-    if calibration is None:
+    elif calibration is None:
         raise InputError(
             "step_mm: expected mm from one B-scan to the next, or the probe's calibration in the capture, found neither"
         )
-    swept = sweep_part.read_sweep(capture, recording.sweep)
-    world_from_image = swept.poses() @ calibration.target_from_image
-    known = np.flatnonzero(np.isfinite(world_from_image).all(axis=(1, 2)))
-    led = on_slide(world_from_image[known], recording.times[known])
-    if isinstance(led, str):
-        return led
-    which = beside(led[0])
-    return known[which], led[0][which], led[1]
+    else:
+        track = sweep_part.read_sweep(capture, recording.sweep).track
+        during = track.found & (track.times >= recording.times[0]) & (track.times <= recording.times[-1])
+        times = track.times[during]
+        which = np.flatnonzero((recording.times >= times[0]) & (recording.times <= times[-1])) if len(times) else np.zeros(0, int)
+        led = on_slide(track.poses[during] @ calibration.target_from_image, times, recording.times[which])
+        if isinstance(led, str):
+            return led
+        placed = led
+    used = beside(placed.poses)
+    return which[used], Placed(placed.poses[used], placed.errors_mm[:, used])
 
 
-def on_slide(world_from_image: Array, times: NDArray[np.int64]) -> tuple[Array, float] | str:
-    """Poses : (n, 4, 4) of a probe on a slide without the noise of their tracking, and the relative error of their distances.
+def on_slide(world_from_image: Array, times: NDArray[np.int64], taken: NDArray[np.int64]) -> Placed | str:
+    """Places, at moments : (n,) ns, of a probe on a slide, without most of the noise of its poses : (m, 4, 4) at times : (m,) ns.
 
     A slide goes a smooth way, a polynomial of the time, off which tracked poses scatter. A way that isn't is named as the reason.
-    The poses are told in the frame of the middle one; times : (n,) ns.
     """
     count, parameters = len(times), SMOOTH + 1
-    if count < 3 * parameters:
-        return f"{count} B-scans of steps have a pose, of {3 * parameters} or more"
+    if min(count, len(taken)) < 2 * parameters:
+        return f"{min(count, len(taken))} B-scans of steps have a pose, of {2 * parameters} or more"
     middle = world_from_image[count // 2]
     turns = np.rad2deg(Rotation.from_matrix(middle[:3, :3].T @ world_from_image[:, :3, :3]).as_rotvec())
     local = (world_from_image[:, :3, 3] - middle[:3, 3]) @ middle[:3, :3]
-    design = np.polynomial.polynomial.polyvander((times - times[0]) / (times[-1] - times[0]) - 0.5, SMOOTH)
-    smooth = design @ np.linalg.lstsq(design, np.column_stack([local, turns]))[0]
-    rest = np.column_stack([local, turns]) - smooth
+    design, there = (
+        np.polynomial.polynomial.polyvander((each - times[0]) / (times[-1] - times[0]) - 0.5, SMOOTH) for each in (times, taken)
+    )
+    weights = np.linalg.lstsq(design, np.column_stack([local, turns]))[0]
+    rest = np.column_stack([local, turns]) - design @ weights
     scatter = np.sqrt((rest**2).sum(axis=0) / (count - parameters))
     off_mm, off_deg = float(scatter[:3].max()), float(scatter[3:].max())
     if off_mm > LED[0] or off_deg > LED[1]:
         return f"steps were led unevenly, by {off_mm:.2f} mm and {off_deg:.2f} deg off a smooth way: put the probe on a slide"
-    poses = np.tile(np.eye(4), (count, 1, 1))
+    smooth = there @ weights
+    poses = np.tile(np.eye(4), (len(taken), 1, 1))
     poses[:, :3, 3] = smooth[:, :3]
     poses[:, :3, :3] = Rotation.from_rotvec(np.deg2rad(smooth[:, 3:])).as_matrix()
-    across = design[-1] - design[0]
-    sigma = scatter[2] * np.sqrt(across @ np.linalg.inv(design.T @ design) @ across)
-    return poses, float(sigma / max(abs(smooth[-1, 2] - smooth[0, 2]), 1e-6))
+    return Placed(poses, scatter[2] * (there @ np.linalg.cholesky(np.linalg.inv(design.T @ design))).T)
 
 
 def beside(poses: Array) -> NDArray[np.int64]:
