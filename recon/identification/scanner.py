@@ -528,7 +528,7 @@ def across(
     rows = speckle.bands(images.shape[1], sheet.mm_per_px[1], settings.face_mm, settings.grain_band_mm)
     rows = [band for band in rows if ((images[:, band] == 0) | (images[:, band] == 255)).mean() < speckle.CLIPPED]
     steps, grey, without = speckle.across(images, local[:, 2], sheet.mm_per_px, rows)
-    shifts = _lag_errors(local[:, 2], np.zeros((0, len(images))) if errors_mm is None else errors_mm)
+    shifts = speckle.lag_errors(local[:, 2], np.zeros((0, len(images))) if errors_mm is None else errors_mm)
     near = (steps > 0.02) & (steps < REACH_MM)
     if near.sum() < 3 or len(rows) < 3 or not (grey[:, near] > 0.1).any():
         return Findings(unknown={f"ultrasound.{name}": "no two B-scans show the same grains" for name in names})
@@ -559,14 +559,6 @@ def across(
             source = f"grains of {len(images)} B-scans side by side, and the frequency"
             estimates[f"ultrasound.{name}"] = Estimate(value, value * float(np.hypot(sigma, settings.beam)), source)
     return Findings(estimates, unknown)
-
-
-def _lag_errors(places_mm: Array, errors_mm: Array) -> Array:
-    """Errors : (q, s) mm of the distances of `speckle.lags`, each the mean over its pairs, by q errors of the places : (q, n)."""
-    distinct, first, second, pair = speckle.lags(places_mm)
-    longer = np.sign(places_mm[second] - places_mm[first]) * (errors_mm[:, second] - errors_mm[:, first])
-    count = np.bincount(pair, minlength=len(distinct))
-    return np.array([np.bincount(pair, each, len(distinct)) / count for each in longer]).reshape(len(errors_mm), len(distinct))
 
 
 def dark_columns(images: Images, sigmas: float = 6.0) -> Mapping[int, Estimate]:

@@ -114,6 +114,14 @@ def lags(steps_mm: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], 
     return 0.01 * distinct, first, second, pair
 
 
+def lag_errors(places_mm: Array, errors_mm: Array) -> Array:
+    """Errors : (q, s) mm of the distances of `lags`, each the mean over its pairs, by q errors of the places : (q, n)."""
+    distinct, first, second, pair = lags(places_mm)
+    longer = np.sign(places_mm[second] - places_mm[first]) * (errors_mm[:, second] - errors_mm[:, first])
+    count = np.bincount(pair, minlength=len(distinct))
+    return np.array([np.bincount(pair, each, len(distinct)) / count for each in longer]).reshape(len(errors_mm), len(distinct))
+
+
 def across(images: Images, steps_mm: Array, mm_per_px: tuple[float, float], rows: list[slice]) -> tuple[Array, Array, Array]:
     """Correlations of grey levels of B-scans : (n, h, w) that stand at places : (n,) mm across their plane.
 
