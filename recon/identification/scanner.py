@@ -346,9 +346,9 @@ def _adjusted(
         rest = (speckle.grey_correlation(correlations(theta, told)) - grey) @ whiten.T
         return np.concatenate([rest.ravel(), (theta - prior[:, 0]) / prior[:, 1]])
 
-    starts = sorted(starts, key=lambda start: float((residuals(start) ** 2).sum()))[:3]
-    fits = [least_squares(residuals, start, method="trf", x_scale=prior[:, 1], max_nfev=25, ftol=1e-6) for start in starts]
-    best = min(fits, key=lambda fit: fit.cost)
+    follow = partial(least_squares, residuals, method="trf", x_scale=prior[:, 1], ftol=1e-6)
+    begun = sorted((follow(start, max_nfev=4) for start in starts), key=lambda fit: fit.cost)  # starts' own costs mislead
+    best = min((follow(fit.x, max_nfev=25) for fit in begun[:2]), key=lambda fit: fit.cost)
     inverse = np.linalg.inv(best.jac.T @ best.jac)
     data = best.jac[: -len(prior)].reshape(*grey.shape, -1)
     moved = np.einsum("kbm,bmp->kbp", apart @ whiten.T, data) @ inverse

@@ -18,7 +18,7 @@ from twin.ultrasound.transducer import Transducer
 
 __all__ = ["optics"]  # a fixture
 
-NARROW = tuple(f"{part}.image_size=[112,408]" for part in ("rig.probe", "ultrasound"))
+NARROW = tuple(f"{part}.image_size=[96,408]" for part in ("rig.probe", "ultrasound"))
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_a_rendered_phantom_gives_a_scanner_for_other_verbs(tmp_path, capsys):
     for name in ("dynamic_range_db", "receive_f_number", "transmit_focus_mm", "gain_db", "tgc_db_per_cm_mhz", "elevation_mm"):
         sigma = found[f"ultrasound.{name}"]["sigma"]
         assert abs(getattr(read_back, name) - getattr(truth, name)) < 4 * sigma < 0.5 * abs(getattr(truth, name)), name
-    assert read_back.image_size == (112, 408) and read_rig(ours / "rig.yaml").probe.image_size == (112, 408)
-    again = [f"rig={ours / 'rig.yaml'}", f"ultrasound={ours / 'ultrasound.yaml'}", *stroke, "path.end_mm=[4,-60]"]
+    assert read_back.image_size == (96, 408) and read_rig(ours / "rig.yaml").probe.image_size == (96, 408)
+    again = [f"rig={ours / 'rig.yaml'}", f"ultrasound={ours / 'ultrasound.yaml'}", *stroke, "path.end_mm=[4,-40]"]
     assert main(["sweep", *again, f"out={tmp_path / 'again'}"]) == 0
-    assert read_manifest(tmp_path / "again" / "capture").devices["us"].size == (112, 408)
+    assert read_manifest(tmp_path / "again" / "capture").devices["us"].size == (96, 408)
