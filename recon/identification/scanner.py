@@ -296,7 +296,7 @@ def _beam(
     given = np.array([(np.log(f.value), f.sigma / f.value), settings.interpolated])
     starts = []
     for focus in (10.0, 16.0, 23.0, 32.0):
-        for receive, transmit in ((1.8, 3.5), (2.5, 2.5), (3.2, 2.0)):
+        for receive, transmit in ((1.8, 3.5), (2.6, 2.4)):
             starts.append(prior[:, 0].copy())
             starts[-1][:3] = np.log([receive, transmit, focus])
     fit = _adjusted(correlations, grains.along[:, chosen], grains.along_without[..., chosen], prior, given, starts)

@@ -20,7 +20,7 @@ RECORDED_MM_PX = (0.0854, 0.0790)  # of its configuration
 @pytest.fixture(scope="module")
 def usual():
     """A narrow image by a noisy linear array, whose pulse its rows show, and what is recorded of tissue that loses less."""
-    array = Transducer(image_size=(96, 620), scale_mm_per_px=(0.1229, 0.06), noise_db=-45.0)
+    array = Transducer(image_size=(96, 520), scale_mm_per_px=(0.1229, 0.06), noise_db=-45.0)
     return array, scanner_draws.recorded(array, LOSS, 3, places=6, steps=0)
 
 
