@@ -118,9 +118,7 @@ def identify(settings: Fields, capture: Path, manifest: Manifest, rig: Rig, watc
         clip = _clip(settings, calibration)
         images = {kind: _images([recordings[kind].paths[k] for k in which], clip) for kind, which in chosen.items()}
     for kind, stack in images.items():
-        if stack.shape[1:] != images["tissue"].shape[1:]:
-            (h, w), (height, width) = stack.shape[1:], images["tissue"].shape[1:]
-            raise InputError(f"{kind}: expected B-scans of {width}x{height} as those of tissue, found {w}x{h}")
+        _check_size(kind, stack, images["tissue"])
     rig = _with_probe(rig, settings, base, calibration, images["tissue"])
     sheet = _sheet(settings, base, rig)
     _check_tissue(settings, images, sheet)
@@ -133,6 +131,7 @@ def identify(settings: Fields, capture: Path, manifest: Manifest, rig: Rig, watc
         else:
             which, at = placed
             stepped = _images([recordings["steps"].paths[k] for k in which], clip), at.poses, at.errors_mm
+            _check_size("steps", stepped[0], images["tissue"])
     else:
         why = "no B-scans of even tissue side by side"
         found |= Findings(unknown=dict.fromkeys((f"{GROUP}elevation_mm", f"{GROUP}elevation_focus_mm"), why))
@@ -230,6 +229,12 @@ def _images(paths: list[Path], clip: Clip | None) -> Images:
             raise InputError(f"{path}: expected {width}x{height} as of those before, found {w}x{h}")
         found.append(np.asarray(luma(image, 255), np.uint8))
     return np.stack(found)
+
+
+def _check_size(kind: str, images: Images, tissue: Images) -> None:
+    (height, width), (h, w) = tissue.shape[1:], images.shape[1:]
+    if (h, w) != (height, width):
+        raise InputError(f"{kind}: expected B-scans of {width}x{height} as those of tissue, found {w}x{h}")
 
 
 def _with_probe(rig: Rig, settings: Fields, base: Mapping[str, Any], calibration: ProbeCalibration | None, images: Images) -> Rig:

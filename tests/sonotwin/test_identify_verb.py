@@ -130,6 +130,7 @@ def test_what_shows_no_scanner_is_refused(sweeps, capture, tmp_path, capsys):
         (["tissue=black", scale], "tissue: expected even tissue all over, found 100 % black in black: no contact?"),
         (["tissue=lifted", "air=air", scale], "tissue: expected B-scans brighter than those in air"),
         (["tissue=tissue", f"air={other}", scale], "air: expected B-scans of 48x300 as those of tissue, found 40x300"),
+        (["tissue=tissue", f"steps={other}", "step_mm=0.2", scale], "steps: expected B-scans of 48x300 as those of tissue"),
         (["tissue=tissue"], "mm_per_px: expected the size of a pixel"),
         (["tissue=tissue", "steps=tissue", scale], "step_mm: expected mm from one B-scan to the next"),
         (["tissue=tissue", "ultrasound=curved", scale], "ultrasound: expected the description of a linear array"),
