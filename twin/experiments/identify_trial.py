@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.capture.manifest import SCANNER, read_manifest, sweep_part
+from recon.capture.manifest import SCANNER, sweep_part
 from recon.files.metrics import Metrics
 from recon.identification.estimates import Findings
 from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
 from recon.model.rig import Probe, Rig
-from recon.session import rig_step, scanner_step
+from recon.session import rig_step
 from scenes.acoustics import TISSUES
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
@@ -96,16 +96,6 @@ def identify_recorded(
         **scanner_sheet(array, seed),
     )
     return rig_step.identify(chosen)[:2]
-
-
-def identify_scanner(rig: Rig, array: Transducer, out: Path, seed: int) -> scanner_step.Found:
-    """Record a scanner's sweeps alone, and identify it from these and its sheet."""
-    rig = with_scanner(rig, array)
-    record_sweeps(rig, array, out, seed)
-    fields = scanner_step.Fields(**scanner_sheet(array, seed))
-    found = scanner_step.identify(fields, out / CAPTURE, read_manifest(out / CAPTURE), rig)
-    assert found is not None
-    return found
 
 
 def with_scanner(rig: Rig, array: Transducer) -> Rig:
