@@ -38,7 +38,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "train": {"", "detector.safetensors", "segmenter.safetensors", "masses.onnx"},
     "calibrate-optics": {"optics.yaml"},
     "calibrate-target": {"target.yaml"},
-    "identify": {"", "rig.yaml", "conditions.yaml"},
+    "identify": {"", "rig.yaml", "conditions.yaml", "ultrasound.yaml"},
     "compare-twin": {"", "report.html"},
     "calibrate-tip": {"tip.yaml"},
     "calibrate-probe": {"probe.yaml"},

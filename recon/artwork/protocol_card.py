@@ -85,8 +85,8 @@ STEPS = (
     Step(
         4,
         "Ultrasound",
-        "B-scans of even tissue, each elsewhere; the probe in air; steps of 0.2 mm",
-        "the scanner: `recon.identification.scanner`, in Python",
+        "B-scans of a tissue phantom, each elsewhere; the probe in air; the probe on a slide, 0.2 mm from one to the next",
+        "[the scanner](#the-scanner)",
         "Depth, gain and focus as in use; gel on a phantom without cysts; a micrometer moves the probe.",
         ("20 B-scans or more of speckle alone", "nothing is white all over"),
         "session/us, any format of docs/freehand.md",

@@ -17,7 +17,8 @@ from scipy.ndimage import uniform_filter
 from scipy.special import eval_genlaguerre, gammaln, roots_genlaguerre
 
 from recon.identification import grey_map, speckle
-from recon.identification.grey_map import Curve
+from recon.identification.estimates import Estimate, Findings
+from recon.identification.grey_map import Curve, few
 
 Array = NDArray[np.float64]
 Images = NDArray[np.uint8]
@@ -27,6 +28,7 @@ START_LOOKS = 3.0  # what their mean is taken for: a map of any form fits more o
 ROUNDS = 4
 WIDEST_PX = 7  # between lines
 NODES = 120  # of the quadrature over a power
+GROUPS = 4  # of B-scans, by whose scatter figures are uncertain
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,27 @@ def measure(images: Images, mm_per_px: tuple[float, float], settings: PatchSetti
     deep_mm, along_mm = (np.array([step * half_width(row) for row in each]) for each, step in ((deep, sy), (along, sx)))
     shares = np.cumsum(counts.sum(axis=(0, 1))) / counts.sum()
     return Figures(mean.mean(axis=1), np.sqrt(variance) / mean.mean(axis=1), deep_mm, along_mm, shares)
+
+
+def summary(images: Images, mm_per_px: tuple[float, float], settings: PatchSettings = PatchSettings()) -> Findings:
+    """Contrast and size of the grains as displayed, over all depths, of B-scans : (n, h, w), by which a picture can be set.
+
+    And the distance of its lines, if columns between them are interpolated.
+    """
+    names, wide = ("contrast", "deep_mm", "along_mm"), mm_per_px[0] * images.shape[2]
+    if wide < settings.size_mm[0]:
+        why = f"images are {wide:.1f} mm wide, less than the {settings.size_mm[0]:g} mm of a patch"
+        return Findings(unknown={f"speckle.{name}": why for name in names})
+    groups = [measure(group, mm_per_px, settings) for group in np.array_split(images, min(GROUPS, len(images)))]
+    source, found = f"greys of {len(images)} B-scans", dict[str, Estimate]()
+    for name in names:
+        each = np.array([getattr(group, name).mean() for group in groups])
+        sigma = each.std(ddof=1) / np.sqrt(len(each)) * few(len(each) - 1)
+        found[f"speckle.{name}"] = Estimate(float(each.mean()), float(sigma), source)
+    if (spacing := line_spacing_px(images)) is not None:
+        resolved = spacing**2 / images.shape[2]  # of a spectrum as long as a row; half of it is likely
+        found["ultrasound.picture.line_mm"] = Estimate(mm_per_px[0] * spacing, mm_per_px[0] * resolved / 2, source)
+    return Findings(found)
 
 
 def predict(found: Displayed, mm_per_px: tuple[float, float]) -> Figures:

@@ -33,7 +33,7 @@ def apply(rig: Rig, findings: Findings) -> Rig:
     content = rig.model_dump(mode="json")
     numbers = {name: value for name, value in findings.estimates.items() if name.partition(".")[0] in Rig.model_fields}
     for name, estimate in numbers.items():
-        _put(content, name, estimate.value)
+        put(content, name, estimate.value)
     for camera in ("cam1", "cam2"):
         if f"{camera}.optics.focal_px.0" in numbers:
             device = content[camera]
@@ -51,8 +51,8 @@ def next_version(rig: Rig, capture: str, day: date) -> Rig:
     return rig.model_copy(update={"version": rig.version + 1, "identified": Identified(day=day, capture=capture)})
 
 
-def _put(content: Any, name: str, value: float) -> None:
-    """Put a number into nested maps and lists by its dotted name."""
+def put(content: Any, name: str, value: float) -> None:
+    """Put a number into nested maps and lists by its dotted name; InputError if there is none of that name."""
     *parents, last = name.split(".")
     try:
         for key in parents:
@@ -69,7 +69,14 @@ def write(path: Path, rig: Rig, unknown: Mapping[str, str], heading: str) -> Non
     unknown : numbers that the captures don't show, and why
     heading : a line or more at the top, about what it was measured from
     """
-    lines = [*(f"# {line}" for line in heading.splitlines()), *_lines(rig.model_dump(mode="json"), "", rig.measured, unknown)]
+    write_fields(path, rig.model_dump(mode="json"), rig.measured, unknown, heading)
+
+
+def write_fields(
+    path: Path, content: Mapping[str, Any], measured: Mapping[str, Measured], unknown: Mapping[str, str], heading: str
+) -> None:
+    """Write any description likewise, by the dotted names of its fields."""
+    lines = [*(f"# {line}" for line in heading.splitlines()), *_lines(content, "", measured, unknown)]
     with atomic.new_file(path) as new:
         new.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -9,6 +9,10 @@ What shows what; all lengths across the depth are in wavelengths:
 - wires in water: apertures and foci once more, with greys a dB from tissue; see `wire_spread`
 - a tank's bottom: its repeats are R x `face_reflection` apart, but clip as the bottom does, and R is of the bottom
 
+All of it rests on raw speckle. Behind a scanner that compounds or smooths, or whose grey map is bent, numbers would be off by up
+to 30 standard deviations: they are named as unknown, and grains measured as displayed. Unsharp masks, which scale contrast alone,
+look like another dynamic range.
+
 A detected image holds no carrier: the frequency is read off the probe, and its uncertainty goes into all that is known in
 wavelengths. The tissue's attenuation and echo are those of the phantom's sheet.
 """
@@ -16,13 +20,14 @@ wavelengths. The tissue's attenuation and echo are those of the phantom's sheet.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from recon.identification import grey_map, sound_beam, speckle
+from recon.identification import displayed_speckle, grey_map, sound_beam, speckle
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.grey_map import Levels, few
 from recon.identification.sound_beam import Across, Along
@@ -34,6 +39,7 @@ Images = NDArray[np.uint8]
 NO_CARRIER = "detected images hold no carrier: read off the probe"
 USUAL_BAND = 0.5  # of an echo over the frequency, where it isn't known
 NO_TISSUE = "no B-scans of even tissue"
+REACH_MM = 2.0  # across the plane, within which B-scans may show the same grains
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,9 @@ class Recordings:
     air: Images | None = None  # of the probe in air
     steps: Images | None = None  # of even tissue, a fraction of the slice apart
     steps_world_from_image: Array | None = None  # (n, 4, 4) mm, their poses
+    steps_errors_mm: Array | None = (
+        None  # (q, n) of their places across the plane: q independent errors of one standard deviation
+    )
 
 
 @dataclass(frozen=True)
@@ -73,9 +82,12 @@ class Settings:
     seen: float = 0.4  # of what was assumed beforehand: parameters known no better than by this are unknown
     relative: float = 0.3  # worse than by this, they are unknown
     clipped: float = 0.15  # share of black and white pixels in bands that show it, at most
-    skew_off: float = 0.2  # of greys' skewness from that of raw speckle, beyond which grains aren't raw, and
-    skew_sigmas: float = 4.0  # standard deviations by the scatter from band to band; two looks averaged are off by 0.36
+    skew_off: float = (
+        0.06  # of greys' skewness from that of raw speckle, beyond which grains aren't raw: 12 drawn scanners were off
+    )
+    skew_sigmas: float = 4.0  # by 0.023 at most; standard deviations by bands. Smoothed over half a column it is off by 0.15
     nonblack: float = 0.02  # share of pixels, under which noise is below the last grey
+    uneven_db: float = 2.0  # of the tissue's level from place to place, beyond which it isn't even
 
 
 USUAL = Settings()
@@ -113,17 +125,43 @@ def identify(recordings: Recordings, sheet: Sheet, settings: Settings = USUAL) -
     rows = speckle.bands(recordings.tissue.shape[1], sheet.mm_per_px[1], settings.face_mm, settings.level_band_mm)
     levels = _levels(recordings.tissue, rows, part, sheet)
     noise = None if recordings.air is None else air_levels(recordings.air, rows, sheet, levels.greys_a_db)
-    found |= _greys(recordings.tissue, rows, part, levels, settings)
+    uneven = unevenness_db(recordings.tissue, sheet, levels.greys_a_db, settings)
+    greys, raw = _greys(recordings.tissue, rows, part, levels, uneven, settings)
+    found |= greys
     beam, focus = along(recordings.tissue, part, sheet, _share(levels, noise, settings), settings)
     found |= beam
     found |= _gains(levels, noise, focus, sheet, settings)
     if recordings.air is not None:
         found |= face_ring(recordings.air, sheet, levels, settings)
     if recordings.steps is not None and recordings.steps_world_from_image is not None:
-        found |= across(
-            recordings.steps, recordings.steps_world_from_image, sheet, _share(levels, noise, settings), found, settings
-        )
-    return found
+        share = _share(levels, noise, settings)
+        placed = recordings.steps, recordings.steps_world_from_image, recordings.steps_errors_mm
+        found |= across(*placed, sheet, share, found, settings)
+    if raw:
+        return found
+    first = int(settings.face_mm / sheet.mm_per_px[1])
+    return _as_if_raw(found) | displayed_speckle.summary(recordings.tissue[:, first:], sheet.mm_per_px)
+
+
+def _as_if_raw(found: Findings) -> Findings:
+    """What would be known if grains were raw speckle, as a reason each."""
+    why = "grains aren't raw speckle; if they were, it had come out as {:.3g}"
+    return Findings(unknown=found.unknown | {name: why.format(one.value) for name, one in found.estimates.items()})
+
+
+def unevenness_db(images: Images, sheet: Sheet, greys_a_db: float, settings: Settings = USUAL) -> float:
+    """Standard deviation, dB, of the tissue's level from place to place, of B-scans : (n, h, w), beyond that of its speckle.
+
+    Places are strips of columns by four bands of rows; a strip's own mean, such as of the array's ends, doesn't count.
+    """
+    rows = speckle.bands(images.shape[1], sheet.mm_per_px[1], settings.face_mm, settings.level_band_mm)
+    strips = max(int(images.shape[2] * sheet.mm_per_px[0] / speckle.STRIP_MM), 1)
+    edges = np.linspace(0, images.shape[2], strips + 1).astype(int)
+    mean = np.array([[images[:, band, a:b].mean(axis=(1, 2)) for a, b in pairwise(edges)] for band in rows]) / greys_a_db
+    mean = mean - mean.mean(axis=2, keepdims=True)  # (bands, strips, n)
+    four = mean[: len(mean) // 4 * 4].reshape(-1, 4, *mean.shape[1:])
+    by_speckle = four.var(axis=1, ddof=1).mean() / 4
+    return float(np.sqrt(max(four.mean(axis=1).var() - by_speckle, 0.0)))
 
 
 def _levels(images: Images, rows: list[slice], part: NDArray[np.int64], sheet: Sheet) -> Levels:
@@ -153,23 +191,30 @@ def _share(levels: Levels, noise: Levels | None, settings: Settings) -> Callable
     return lambda depth: np.interp(depth, levels.depth_mm, share)
 
 
-def _greys(images: Images, rows: list[slice], part: NDArray[np.int64], levels: Levels, settings: Settings) -> Findings:
-    """The grey map, unless grains are other than raw: skewed by other than the logarithm of an exponential power, clipped."""
+def _greys(
+    images: Images, rows: list[slice], part: NDArray[np.int64], levels: Levels, uneven_db: float, settings: Settings
+) -> tuple[Findings, bool]:
+    """The grey map, and whether grains may be raw: not skewed by other than the logarithm of an exponential power."""
     counts = grey_map.histograms(images, rows, part).sum(axis=0)
     clipped = (counts[:, 0] + counts[:, -1]) / counts.sum(axis=1)
     seen = clipped < settings.clipped
     name = "ultrasound.dynamic_range_db"
     if seen.sum() < 4:
-        return Findings(unknown={name: "too much of the tissue is black or white to see whether its grains are raw"})
+        return Findings(unknown={name: "too much of the tissue is black or white to see whether its grains are raw"}), True
+    if uneven_db > settings.uneven_db:
+        return Findings(
+            unknown={name: f"the tissue isn't even: its level differs by {uneven_db:.1f} dB from place to place"}
+        ), False
     skewed, raw = (grey_map.skewness(shares[seen]) for shares in (counts, levels.shares()))
     off = float((skewed - raw).mean())
     error = float((skewed - raw).std(ddof=1) / np.sqrt(seen.sum()))
     if abs(off) > max(settings.skew_off, settings.skew_sigmas * error):
         why = f"grains aren't raw speckle, or the grey map is bent: skewed by {skewed.mean():.2f}, not {raw.mean():.2f}; "
-        return Findings(unknown={name: why + f"if they were raw, a dB had {levels.greys_a_db:.2f} greys"})
-    relative = float(np.hypot(np.sqrt(levels.covariance[0, 0]), settings.spread))
+        return Findings(unknown={name: why + f"if they were raw, a dB had {levels.greys_a_db:.2f} greys"}), False
+    widened = (uneven_db / speckle.SPREAD_DB) ** 2 / 2  # of the spread, by levels that differ
+    relative = float(np.linalg.norm([np.sqrt(levels.covariance[0, 0]), settings.spread, widened]))
     source = f"spread of the greys of {len(images)} B-scans of even tissue"
-    return Findings({name: Estimate(levels.dynamic_range_db, levels.dynamic_range_db * relative, source)})
+    return Findings({name: Estimate(levels.dynamic_range_db, levels.dynamic_range_db * relative, source)}), True
 
 
 def along(
@@ -251,7 +296,7 @@ def _beam(
     given = np.array([(np.log(f.value), f.sigma / f.value), settings.interpolated])
     starts = []
     for focus in (10.0, 16.0, 23.0, 32.0):
-        for receive, transmit in ((1.8, 3.5), (2.5, 2.5), (3.2, 2.0)):
+        for receive, transmit in ((1.8, 3.5), (2.6, 2.4)):
             starts.append(prior[:, 0].copy())
             starts[-1][:3] = np.log([receive, transmit, focus])
     fit = _adjusted(correlations, grains.along[:, chosen], grains.along_without[..., chosen], prior, given, starts)
@@ -301,9 +346,9 @@ def _adjusted(
         rest = (speckle.grey_correlation(correlations(theta, told)) - grey) @ whiten.T
         return np.concatenate([rest.ravel(), (theta - prior[:, 0]) / prior[:, 1]])
 
-    starts = sorted(starts, key=lambda start: float((residuals(start) ** 2).sum()))[:3]
-    fits = [least_squares(residuals, start, method="trf", x_scale=prior[:, 1], max_nfev=25, ftol=1e-6) for start in starts]
-    best = min(fits, key=lambda fit: fit.cost)
+    follow = partial(least_squares, residuals, method="trf", x_scale=prior[:, 1], ftol=1e-6)
+    begun = sorted((follow(start, max_nfev=4) for start in starts), key=lambda fit: fit.cost)  # starts' own costs mislead
+    best = min((follow(fit.x, max_nfev=25) for fit in begun[:2]), key=lambda fit: fit.cost)
     inverse = np.linalg.inv(best.jac.T @ best.jac)
     data = best.jac[: -len(prior)].reshape(*grey.shape, -1)
     moved = np.einsum("kbm,bmp->kbp", apart @ whiten.T, data) @ inverse
@@ -458,6 +503,7 @@ def face_ring(images: Images, sheet: Sheet, levels: Levels, settings: Settings =
 def across(
     images: Images,
     world_from_image: Array,
+    errors_mm: Array | None,
     sheet: Sheet,
     share: Callable[[Array], Array],
     found: Findings,
@@ -468,22 +514,25 @@ def across(
     Parameters
     ----------
     world_from_image : (n, 4, 4) mm, of B-scans : (n, h, w) that are parallel, side by side
+    errors_mm : (q, n) of their places, as of `Recordings`
     found : with the bandwidth, if that is known
     """
     names = ("elevation_mm", "elevation_focus_mm")
     offset = world_from_image[:, :3, 3] - world_from_image[0, :3, 3]
     local = offset @ world_from_image[0, :3, :3]
-    turned = np.abs(world_from_image[:, :3, :3] - world_from_image[0, :3, :3]).max()
-    if np.abs(local[:, :2]).max() > 0.1 or turned > 0.005:
+    first, second = np.nonzero(np.abs(local[:, None, 2] - local[:, 2]) < REACH_MM)
+    turned = np.abs(world_from_image[first, :3, :3] - world_from_image[second, :3, :3]).max()
+    if np.abs(local[first, :2] - local[second, :2]).max() > 0.1 or turned > 0.005:
         why = "B-scans aren't parallel side by side, within 0.1 mm and 0.3 degrees: other shifts take their share of the grains"
         return Findings(unknown={f"ultrasound.{name}": why for name in names})
     rows = speckle.bands(images.shape[1], sheet.mm_per_px[1], settings.face_mm, settings.grain_band_mm)
     rows = [band for band in rows if ((images[:, band] == 0) | (images[:, band] == 255)).mean() < speckle.CLIPPED]
     steps, grey, without = speckle.across(images, local[:, 2], sheet.mm_per_px, rows)
-    near = (steps > 0.02) & (steps < 2.0)
+    shifts = speckle.lag_errors(local[:, 2], np.zeros((0, len(images))) if errors_mm is None else errors_mm)
+    near = (steps > 0.02) & (steps < REACH_MM)
     if near.sum() < 3 or len(rows) < 3 or not (grey[:, near] > 0.1).any():
         return Findings(unknown={f"ultrasound.{name}": "no two B-scans show the same grains" for name in names})
-    depth, steps = _middles(rows, sheet.mm_per_px[1]), steps[near]
+    depth, steps, shifts = _middles(rows, sheet.mm_per_px[1]), steps[near], shifts[:, near]
     known, f = share(depth), sheet.frequency_mhz
     end = sheet.mm_per_px[1] * (images.shape[1] - 1)
     ends = [
@@ -494,10 +543,11 @@ def across(
     def correlations(theta: Array, told: Array) -> Array:
         slab = Across(1e-3 * sheet.assumed_speed / float(np.exp(told[0])), *np.exp(theta))
         return known[:, None] * np.array(
-            [sound_beam.alike_across(slab, each, steps, own) for each, own in zip(depth, band, strict=True)]
+            [sound_beam.alike_across(slab, each, steps + told[1:] @ shifts, own) for each, own in zip(depth, band, strict=True)]
         )
 
-    prior, given = np.array([LIKELY[name] for name in names]), np.array([(np.log(f.value), f.sigma / f.value)])
+    prior = np.array([LIKELY[name] for name in names])
+    given = np.array([(np.log(f.value), f.sigma / f.value), *[(0.0, 1.0)] * len(shifts)])
     starts = [np.log([height, focus]) for height in (3.3, 4.6, 6.5) for focus in (12.0, 16.0, 21.0, 28.0)]
     fit = _adjusted(correlations, grey[:, near], without[..., near], prior, given, starts, by_band=True)
     estimates, unknown = {}, {}
@@ -511,16 +561,18 @@ def across(
     return Findings(estimates, unknown)
 
 
-def dark_columns(images: Images, sigmas: float = 6.0) -> Mapping[int, float]:
-    """Columns darker than those beside them in all B-scans : (n, h, w), of dead elements, and by how many greys.
+def dark_columns(images: Images, sigmas: float = 6.0) -> Mapping[int, Estimate]:
+    """Columns darker than those beside them in all B-scans : (n, h, w), as of dead elements, and their greys below these.
 
     Tissue moves on from image to image, columns stay: the scatter from image to image is the noise.
     """
     mean = images.astype(float).mean(axis=1)
     padded = np.pad(mean, [(0, 0), (4, 4)], mode="edge")
-    around = np.stack([padded[:, k : k + mean.shape[1]] for k in (0, 1, 2, 6, 7, 8)])
-    below = np.median(around, axis=0) - mean
+    sides = [np.median([padded[:, k : k + mean.shape[1]] for k in side], axis=0) for side in ((0, 1, 2), (6, 7, 8))]
+    below = np.minimum(*sides) - mean  # of both sides: towards the array's ends, images get darker
     middle = below.mean(axis=0)
     spread = below.std(axis=0, ddof=1) / np.sqrt(len(below)) * few(len(below) - 1)
     spread = np.maximum(spread, np.median(spread))
-    return {int(column): float(middle[column]) for column in np.flatnonzero(middle > sigmas * spread)}
+    source = f"{len(images)} B-scans"
+    dark = np.flatnonzero(middle > sigmas * spread)
+    return {int(column): Estimate(float(middle[column]), float(spread[column]), source) for column in dark}

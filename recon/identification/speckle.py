@@ -107,19 +107,31 @@ def measure(
     return Grains(depth, kept, deep_whole, along_whole, deep_without, along_without, np.array(shape))
 
 
+def lags(steps_mm: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Distances : (s,) mm between two of n places : (n,) mm, to a hundredth; and of each pair its two places and its distance."""
+    first, second = np.triu_indices(len(steps_mm), 1)
+    distinct, pair = np.unique(np.round(np.abs(steps_mm[first] - steps_mm[second]) / 0.01), return_inverse=True)
+    return 0.01 * distinct, first, second, pair
+
+
+def lag_errors(places_mm: Array, errors_mm: Array) -> Array:
+    """Errors : (q, s) mm of the distances of `lags`, each the mean over its pairs, by q errors of the places : (q, n)."""
+    distinct, first, second, pair = lags(places_mm)
+    longer = np.sign(places_mm[second] - places_mm[first]) * (errors_mm[:, second] - errors_mm[:, first])
+    count = np.bincount(pair, minlength=len(distinct))
+    return np.array([np.bincount(pair, each, len(distinct)) / count for each in longer]).reshape(len(errors_mm), len(distinct))
+
+
 def across(images: Images, steps_mm: Array, mm_per_px: tuple[float, float], rows: list[slice]) -> tuple[Array, Array, Array]:
     """Correlations of grey levels of B-scans : (n, h, w) that stand at places : (n,) mm across their plane.
 
     Returns
     -------
-    steps_mm : (s,) between B-scans, distinct ones
+    steps_mm : (s,) between B-scans, as of `lags`
     alike : (b, s) of each band
     without : (k, b, s) of all strips of columns but one
     """
-    apart = np.abs(steps_mm[:, None] - steps_mm)
-    first, second = np.triu_indices(len(images), 1)
-    number = np.round(apart[first, second] / 0.01).astype(int)
-    distinct, pair = np.unique(number, return_inverse=True)
+    distinct, first, second, pair = lags(steps_mm)
     width = images.shape[2]
     strips = max(int(width * mm_per_px[0] / STRIP_MM), 2)
     strip = np.minimum(np.arange(width) * strips // width, strips - 1)
@@ -133,7 +145,7 @@ def across(images: Images, steps_mm: Array, mm_per_px: tuple[float, float], rows
                 sums[b, kind, pair[n]] += np.bincount(strip, values, strips)
     total = sums.sum(axis=-1)
     left = total[..., None] - sums
-    return distinct * 0.01, total[:, 0] / total[:, 1], np.moveaxis(left[:, 0] / left[:, 1], -1, 0)
+    return distinct, total[:, 0] / total[:, 1], np.moveaxis(left[:, 0] / left[:, 1], -1, 0)
 
 
 def _detrended(greys: NDArray) -> Array:

@@ -28,12 +28,13 @@ from recon.identification.projector import CameraBlur
 from recon.identification.sensors import DarkStack, FringeStack, ImageSettings
 from recon.model.boards import Discs
 from recon.model.calibration import Calibration
-from recon.model.part import Part, Positive
+from recon.model.part import Positive
 from recon.model.patterns import Fringes
 from recon.model.rig import Rig
 from recon.optical_calibration.joint_calibration import Result
 from recon.registry import Choice
-from recon.session import hand_step, optics_step
+from recon.session import hand_step, optics_step, scanner_step
+from recon.session.scanner_step import ULTRASOUND, Found
 from recon.session.watch import SILENT, Watch
 from recon.structured_light import phase
 from recon.structured_light.decode import decode
@@ -68,11 +69,11 @@ NOT_SEEN = {  # reasons of what no part of a capture shows
 Images = NDArray[np.uint8] | NDArray[np.uint16]
 
 
-class Settings(Part):
+class Settings(scanner_step.Fields):
     """Sources, and what is read off data sheets."""
 
     capture: Path
-    """a capture folder with a board, a surface under fringes, or both, or films"""
+    """a capture folder with a board, a surface under fringes, or both; or with films, or sweeps by the scanner, or all of that"""
     rig: Annotated[Rig, Choice("meza2021")]
     """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
     day: date | None = None
@@ -104,11 +105,13 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, holds neither a board nor fringes nor named films, or `out` can't be written to.
+        If the capture is incomplete or damaged, holds neither a board, fringes nor films or sweeps that are named, or `out` can't
+        be written to.
     """
-    inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes)
+    scans = (Path(name) for name in (settings.tissue, settings.air, settings.steps) if name)
+    inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes, *scans)
     atomic.check_folder(out, BY, inputs=inputs)
-    rig, found = identify(settings, watch)
+    rig, found, scanned = identify(settings, watch)
     for line in describe(found):
         watch.say(line)
     name = read_manifest(settings.capture).name or settings.capture.resolve().name
@@ -124,7 +127,10 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         (new / CONDITIONS).write_text(conditions_text(found), encoding="utf-8")
         content = json.dumps(asdict(found), indent=2, ensure_ascii=False, allow_nan=False)
         (new / FIGURES).write_text(content + "\n", encoding="utf-8")
-    watch.say(f"wrote       {out}/{{{RIG},{CONDITIONS},{FIGURES}}}, version {rig.version} of the rig")
+        if scanned is not None:
+            scanner_step.write(new / ULTRASOUND, scanned, name)
+    written = (RIG, CONDITIONS, *([] if scanned is None else [ULTRASOUND]), FIGURES)
+    watch.say(f"wrote       {out}/{{{','.join(written)}}}, version {rig.version} of the rig")
 
 
 def _day(path: Path) -> date:
@@ -132,13 +138,30 @@ def _day(path: Path) -> date:
 
 
 @linear_algebra.on_one_thread()
-def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
-    """The rig with what was measured in it, and all that the captures show; raises InputError as `run` does."""
+def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings, Found | None]:
+    """The rig with what was measured in it, all that the captures show, and the scanner; raises InputError as `run` does."""
     manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
-    if manifest.board is None and manifest.surface is None:
-        if not (settings.still or settings.hand):
-            raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found neither")
-        return settings.rig, Findings(unknown=NOT_SEEN) | _films(settings, None, watch)
+    seen = manifest.board is not None or manifest.surface is not None
+    for name in ("dark", "flat", "room"):
+        if not seen and getattr(settings, name) is not None:
+            raise InputError(f"{name}: expected a capture with a board or a surface under fringes beside it, found neither")
+    scanned = scanner_step.identify(settings, settings.capture, manifest, settings.rig, watch)
+    if not (seen or scanned is not None or settings.still or settings.hand):
+        names = ", ".join(filter(None, manifest.named_sweeps))
+        there = f"neither, but sweeps {names}; give tissue=NAME, still=[NAME] or hand=[NAME]" if names else "neither"
+        raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found {there}")
+    rig, found = settings.rig, Findings(unknown=NOT_SEEN if seen else {})
+    if scanned is not None:
+        rig, found = scanned.rig, found | scanned.findings
+    if seen:
+        rig, found = _optical(settings, manifest, rig, found, watch)
+    elif settings.still or settings.hand:
+        found |= _films(settings, None, watch)
+    return rig_file.apply(rig, found), found, scanned
+
+
+def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, watch: Watch) -> tuple[Rig, Findings]:
+    """Cameras and projector by the board, the surface, or both; tracker and hand by their calibration."""
     part: PartName = "board" if manifest.surface is None else "surface"
     frames = {
         camera: _frames(settings, camera, device) for camera, device in manifest.devices_of(part).items() if camera in CAMERAS
@@ -147,7 +170,7 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
         if folder is not None and not any((folder / camera).is_dir() for camera in frames):
             there = "a file" if folder.is_file() else "none" if folder.is_dir() else "nothing"
             raise InputError(f"{folder}: expected a folder with images in {' or '.join(frames)}, found {there}")
-    found, rig, board = Findings(unknown=NOT_SEEN), settings.rig, None
+    board = None
     if manifest.board is not None:
         captured = board_part.read_board(settings.capture)
         board = captured, optics_step.calibrate(captured, watch=watch).result
@@ -170,8 +193,7 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings]:
         rig = rig.model_copy(
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
-    rig = rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)})
-    return rig_file.apply(rig, found), found
+    return rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)}), found
 
 
 def _with_own_frames(settings: Settings) -> Settings:
@@ -369,6 +391,8 @@ def describe(found: Findings) -> Iterator[str]:
     for name, one in found.estimates.items():
         device, optics, field = name.partition(".optics.")
         part, _, field = (f"{device}.optics", "", field) if optics else name.rpartition(".")
+        if name.startswith(scanner_step.GROUP):
+            part, _, field = name.partition(".")
         parts.setdefault(part, []).append(f"{field} {one.value:.5g} ± {one.sigma:.2g}")
     for part, numbers in parts.items():
         yield f"measured    {part}: {', '.join(numbers)}"

@@ -87,7 +87,11 @@ def test_each_field_says_its_unit_and_reason(verb):
 
 
 CHOICES = [
-    *[("scene", path.stem, lambda content: parse_scene(content)[1]) for path in sorted((folder() / "scene").glob("*.yaml"))],
+    *[
+        ("scene", path.stem, lambda content: parse_scene(content)[1])
+        for path in sorted((folder() / "scene").glob("*.yaml"))
+        if yaml.safe_load(path.read_text(encoding="utf-8"))["kind"] == path.stem  # others are another choice of a kind
+    ],
     *[("path", name, lambda content: TypeAdapter(AnyPath).validate_python(content)) for name in ("bob", "stroke", "wire")],
     ("tracing", "default", Tracing.model_validate),
     ("poses", "paper", BoardPoses.model_validate),

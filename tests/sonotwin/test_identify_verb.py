@@ -9,12 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.capture.manifest import read_manifest
 from recon.session import rig_step
-from sonotwin.choices import read_rig
+from sonotwin.choices import read, read_rig
 from sonotwin.cli import main
+from tests.recon.session import speckle_captures
 from tests.sonotwin.test_surface_verb import PROJECTOR, SEQUENCES, SIZE, optics, write_capture
+from twin.ultrasound.transducer import Transducer
 
 __all__ = ["optics"]  # a fixture
+
+NARROW = tuple(f"{part}.image_size=[96,408]" for part in ("rig.probe", "ultrasound"))
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +109,78 @@ def test_what_is_no_capture_of_these_is_refused(capture, frames, tmp_path, capsy
         assert main(["identify", *given, f"out={tmp_path / 'ours'}"]) == 2
         said = capsys.readouterr().err
         assert told in said and said.count("\n") == 1 and not (tmp_path / "ours").exists()
+
+
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory) -> Path:
+    """B-scans of made speckle, and some that can't be identified."""
+    rng, folder = np.random.default_rng(8), tmp_path_factory.mktemp("sweeps") / "capture"
+    images = {"tissue": speckle_captures.speckle(6, -22.0, rng), "air": speckle_captures.in_air(3, rng)}
+    images |= {"lifted": speckle_captures.in_air(6, rng), "short": images["tissue"][:2], "black": 0 * images["tissue"]}
+    speckle_captures.write(folder, images, rng)
+    return folder
+
+
+def test_what_shows_no_scanner_is_refused(sweeps, capture, tmp_path, capsys):
+    """In one line, with nothing written."""
+    coloured, other = tmp_path / "coloured", tmp_path / "other"
+    for folder, size in ((coloured, speckle_captures.SIZE), (other, (40, 300))):
+        folder.mkdir()
+        for k in range(4):
+            doppler = np.random.default_rng(k).integers(0, 255, (*size[::-1], 3 if folder == coloured else 1))
+            cv2.imwrite(str(folder / f"{k}.png"), doppler.astype(np.uint8))
+    scale = "mm_per_px=[0.12,0.08]"
+    for given, told in (
+        (["tissue=tisue", scale], "tissue: expected one of the capture's sweeps tissue, air, lifted, short, black or a folder of "
+         "images, found tisue; did you mean tissue?"),
+        ([], "but sweeps tissue, air, lifted, short, black; give tissue=NAME"),
+        (["air=air"], "tissue: expected a sweep or a folder of even tissue with air, found none"),
+        ([f"tissue={coloured}", scale], "0.png: expected a grey B-scan, found"),
+        (["tissue=short", scale], "tissue: expected 3 B-scans or more, found 2 in short"),
+        (["tissue=black", scale], "tissue: expected even tissue all over, found 100 % black in black: no contact?"),
+        (["tissue=lifted", "air=air", scale], "tissue: expected B-scans brighter than those in air"),
+        (["tissue=tissue", f"air={other}", scale], "air: expected B-scans of 48x300 as those of tissue, found 40x300"),
+        (["tissue=tissue", f"steps={other}", "step_mm=0.2", scale], "steps: expected B-scans of 48x300 as those of tissue"),
+        (["tissue=tissue"], "mm_per_px: expected the size of a pixel"),
+        (["tissue=tissue", "steps=tissue", scale], "step_mm: expected mm from one B-scan to the next"),
+        (["tissue=tissue", "ultrasound=curved", scale], "ultrasound: expected the description of a linear array"),
+        (["tissue=tissue", "clip=[100,0,10,300]", scale], "clip: expected a part of an image"),
+        (["tissue=tissue", "frequency_mhz=1000", scale], "frequency_mhz"),
+        (["tissue=tissue", f"dark={coloured}", scale], "dark: expected a capture with a board or a surface under fringes"),
+    ):  # fmt: skip
+        assert main(["identify", f"capture={sweeps}", *given, f"out={tmp_path / 'ours'}"]) == 2, given
+        said = capsys.readouterr().err
+        assert told in said and said.count("\n") == 1 and not (tmp_path / "ours").exists(), said
+
+
+@pytest.mark.slow
+def test_a_rendered_phantom_gives_a_scanner_for_other_verbs(tmp_path, capsys):
+    """Sweeps alone, over gelatin and in air: no number is off by more than 4 standard deviations; and a sweep by the result."""
+    out, hz = tmp_path / "rendered", "clocks.scanner_hz"
+    stroke = ["scene=gelatin", "path.start_mm=[4,-68]", "path.end_mm=[4,48]", "path.speed_mm_s=20", f"{hz}=2"]
+    slide = [
+        "scene=gelatin",
+        "path.start_mm=[4,58]",
+        "path.end_mm=[4,62]",
+        "path.speed_mm_s=2",
+        f"{hz}=10",
+        "path.hand={shift_mm: 0, turn_deg: 0}",
+    ]
+    air = ["scene=tank", "path=bob", "path.middle_mm=[4,-2,600]", "path.seconds=0.2"]
+    for name, given in (("tissue", stroke), ("steps", slide), ("air", air)):
+        assert main(["sweep", *NARROW, *given, f"name={name}", "add=true", f"out={out}"]) == 0
+    named = [f"{name}={name}" for name in ("tissue", "air", "steps")]
+    sheet = ["attenuation_db_per_cm_mhz=0.5", "echo_db=0", "ultrasound.dynamic_range_db=70", "ultrasound.elevation_mm=6"]
+    ours = tmp_path / "ours"
+    assert main(["identify", f"capture={out / 'capture'}", *named, *sheet, f"out={ours}"]) == 0
+    said = capsys.readouterr().out
+    assert "measured    ultrasound: dynamic_range_db" in said and "wrote " in said and "ultrasound.yaml" in said
+    truth, found = Transducer(), json.loads((ours / "identified.json").read_text())["estimates"]
+    read_back = Transducer.model_validate(read("ultrasound", ours / "ultrasound.yaml"))
+    for name in ("dynamic_range_db", "receive_f_number", "transmit_focus_mm", "gain_db", "tgc_db_per_cm_mhz", "elevation_mm"):
+        sigma = found[f"ultrasound.{name}"]["sigma"]
+        assert abs(getattr(read_back, name) - getattr(truth, name)) < 4 * sigma < 0.5 * abs(getattr(truth, name)), name
+    assert read_back.image_size == (96, 408) and read_rig(ours / "rig.yaml").probe.image_size == (96, 408)
+    again = [f"rig={ours / 'rig.yaml'}", f"ultrasound={ours / 'ultrasound.yaml'}", *stroke, "path.end_mm=[4,-40]"]
+    assert main(["sweep", *again, f"out={tmp_path / 'again'}"]) == 0
+    assert read_manifest(tmp_path / "again" / "capture").devices["us"].size == (96, 408)

@@ -7,6 +7,7 @@ import numpy as np
 
 from recon.model.rig import CameraDevice, Optics, ProjectorDevice, Rig
 from twin.conditions import Conditions, Frames
+from twin.ultrasound.transducer import Transducer
 
 CAMERA_SIZES = ((640, 512), (800, 640), (960, 768), (1280, 1024))  # px; the smallest has 0.3 MP
 PIXELS_UM = (2.4, 3.45, 4.8, 5.5, 6.9)
@@ -23,6 +24,33 @@ def draw(rig: Rig, seed: int) -> tuple[Rig, Conditions]:
     projector = _projector(rig.projector, PROJECTOR_SIZES[rng.integers(len(PROJECTOR_SIZES))], rng)
     frames = Frames(flicker=rng.uniform(0.002, 0.02), stray_dn=rng.uniform(0.1, 1.0), shift=rng.uniform(0.002, 0.05))
     return rig.model_copy(update={**cameras, "projector": projector}), Conditions(frames=frames)
+
+
+def draw_scanner(rng: np.random.Generator) -> Transducer:
+    """Draw a linear array of 4 to 12 MHz and a narrow image, with rows of half a wavelength at most."""
+    u = rng.uniform
+    frequency, depth = u(4, 12), u(30, 45)
+    row = min(u(0.04, 0.09), 0.77 / frequency)
+    band = u(0.4, 0.8)
+    return Transducer(
+        image_size=(128, int(depth / row)),
+        scale_mm_per_px=(u(0.08, 0.14), row),
+        frequency_mhz=frequency,
+        bandwidth=(band, band * u(0.7, 1)),
+        transmit_focus_mm=u(12, 30),
+        transmit_f_number=u(1.8, 4),
+        receive_f_number=u(1.5, 4),
+        aperture_mm=u(12, 30),
+        elevation_mm=u(3, 7),
+        elevation_focus_mm=u(14, 30),
+        face_ring_mm=u(0.15, 0.5),
+        face_ring_db=u(-5, 8),
+        tgc_db_per_cm_mhz=u(0.3, 0.7),
+        gain_db=u(-35, -22),
+        noise_db=u(-70, -40),
+        dynamic_range_db=u(45, 80),
+        scatterers_per_mm3=64 * max(1, (frequency / 7.5) ** 2),
+    )
 
 
 def _camera(

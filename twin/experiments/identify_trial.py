@@ -1,33 +1,41 @@
 """Rigs drawn at random, their captures rendered, and the rigs identified from these, in units of what is said of their errors.
 
 The rig's sheet, which identification begins with, has what is read off data sheets: sizes, pixels, nominal focal lengths, light.
+The scanner's has its probe's label and the phantom's sheet, both with errors; all else of it is the usual scanner's.
 """
 
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.capture.manifest import SCANNER, sweep_part
 from recon.files.metrics import Metrics
 from recon.identification.estimates import Findings
 from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
-from recon.model.rig import Rig
+from recon.model.rig import Probe, Rig
 from recon.session import rig_step
+from scenes.acoustics import TISSUES
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
 from twin import board_session
 from twin.conditions import Conditions
 from twin.experiments import drawn_rig
 from twin.experiments.experiment_runs import Experiment, Settings
+from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.sensor import Exposure, electrons_per_radiance, expose
 from twin.session import CAPTURE, Session
+from twin.ultrasound.probe_path import Bob, Hand, SurfacePath
+from twin.ultrasound.timed_sweep import Clocks
+from twin.ultrasound.transducer import Transducer
 from twin.working_range import working_range
 
 Array = NDArray[np.float64]
@@ -38,6 +46,22 @@ CAMERAS = board_session.CAMERAS
 POSES = 10  # of the board
 FRAMES = 16  # dark ones, and flat ones of each level
 LEVELS = (0.3, 0.8)  # of full scale, of flat frames
+PHANTOM = {  # even gelatin
+    "kind": "test_object",
+    "size_mm": (80.0, 160.0, 60.0),
+    **dict.fromkeys(("filament_depths_mm", "row_x_mm", "cysts", "bright", "dark"), ()),
+}
+STILL = Hand(shift_mm=0.0, turn_deg=0.0)  # of a probe on a slide
+SWEEPS = {  # of the scanner: each elsewhere in tissue; side by side; over water without an echo, as in air
+    "tissue": (PHANTOM, SurfacePath(start_mm=(4.0, -68.0), end_mm=(4.0, 48.0), speed_mm_s=20.0), Clocks(scanner_hz=2.0)),
+    "steps": (
+        PHANTOM,
+        SurfacePath(start_mm=(4.0, 58.0), end_mm=(4.0, 64.0), speed_mm_s=2.0, hand=STILL),
+        Clocks(scanner_hz=10.0),
+    ),
+    "air": ({"kind": "tank"}, Bob(middle_mm=(4.0, -2.0, 600.0), seconds=0.3), Clocks()),
+}
+LABEL, SHEET = 0.05, (0.03, 0.5)  # errors: of the label's frequency, relative; of the attenuation, dB/cm/MHz, and the echo, dB
 NEUTRAL = {  # what is to be identified, as a sheet has it: ordinary values
     "lens": {"f_number": 8.0, "focus_mm": 660.0, "blur_px": 0.5, "vignetting": 0.1},
     "sensor": {"saturation_e": 8000.0, "dark_noise_e": 10.0, "dsnu_e": 5.0, "prnu": 0.008, "black_level_dn": 3.0},
@@ -48,20 +72,61 @@ NEUTRAL = {  # what is to be identified, as a sheet has it: ordinary values
 def measure(settings: Settings, seed: int) -> Metrics:
     """Errors over sigmas of all numbers that were measured, and how many of the 95 % intervals hold the truth."""
     rig, conditions = drawn_rig.draw(settings.rig, seed)
+    array = drawn_rig.draw_scanner(np.random.default_rng([seed, 61]))
+    rig = with_scanner(rig, array)
     with TemporaryDirectory() as folder:
-        _, found = identify_recorded(rig, conditions, Path(folder), settings.poses.seed + seed, seed)
-    return judge(found, truth_of(rig, conditions, found))
+        _, found = identify_recorded(rig, conditions, array, Path(folder), settings.poses.seed + seed, seed)
+    return judge(found, truth_of(rig, conditions, array, found))
 
 
-def identify_recorded(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> tuple[Rig, Findings]:
+def identify_recorded(
+    rig: Rig, conditions: Conditions, array: Transducer, out: Path, poses_seed: int, seed: int
+) -> tuple[Rig, Findings]:
     """Record a rig's captures in a folder, and identify it from these and its sheet."""
     exposures = record_surface(rig, conditions, out, seed)
     record_board(rig, conditions, out, poses_seed, seed)
     record_frames(rig, exposures, out, seed)
+    record_sweeps(rig, array, out, seed)
     chosen = rig_step.Settings(
-        capture=out / CAPTURE, rig=sheet_of(rig), dark=out / "dark", flat=out / "flat", adc_bits=rig.cam1.sensor.adc_bits
+        capture=out / CAPTURE,
+        rig=sheet_of(rig),
+        dark=out / "dark",
+        flat=out / "flat",
+        adc_bits=rig.cam1.sensor.adc_bits,
+        **scanner_sheet(array, seed),
     )
-    return rig_step.identify(chosen)
+    return rig_step.identify(chosen)[:2]
+
+
+def with_scanner(rig: Rig, array: Transducer) -> Rig:
+    """The rig with images of a scanner."""
+    held = rig.probe.target_from_image
+    probe = Probe(image_size=array.image_size, scale_mm_per_px=array.scale_mm_per_px, target_from_image=held)
+    return rig.model_copy(update={"probe": probe})
+
+
+def record_sweeps(rig: Rig, array: Transducer, out: Path, seed: int) -> None:
+    """B-scans of even tissue, by a hand and on a slide, and in air."""
+    for name, (scene, path, clocks) in SWEEPS.items():
+        chosen = SweepSettings(rig=rig, scene=scene, ultrasound=array, path=path, clocks=clocks, name=name, seed=seed)
+        planned = plan_sweep(chosen)
+        planned.write(Session(out, sweep_part(name), {}, True, (SCANNER,), "volume"), planned.scans())
+
+
+def scanner_sheet(array: Transducer, seed: int) -> dict[str, Any]:
+    """Fields of a scanner's identification: the sweeps, and what labels and sheets say, with their errors."""
+    errors = np.random.default_rng([seed, 62]).standard_normal(3)
+    frequency = array.frequency_mhz * (1 + LABEL * float(errors[0]))
+    return {
+        **{name: name for name in SWEEPS},
+        "ultrasound": Transducer(),
+        "frequency_mhz": frequency,
+        "frequency_sigma_mhz": LABEL * frequency,
+        "attenuation_db_per_cm_mhz": TISSUES["gelatin"].attenuation + SHEET[0] * float(errors[1]),
+        "attenuation_sigma": SHEET[0],
+        "echo_db": SHEET[1] * float(errors[2]),
+        "echo_sigma_db": SHEET[1],
+    }
 
 
 def patterns_of(rig: Rig) -> Patterns:
@@ -134,14 +199,19 @@ def sheet_of(rig: Rig) -> Rig:
     return rig.model_copy(update=changed)
 
 
-def truth_of(rig: Rig, conditions: Conditions, found: Findings) -> dict[str, float]:
+def truth_of(rig: Rig, conditions: Conditions, array: Transducer, found: Findings) -> dict[str, float]:
     """True values of what was measured, as far as the twin has them."""
-    truth = dict[str, float]()
+    truth, clocks = dict[str, float](), SWEEPS["steps"][2]
     for name in found.estimates:
         group, _, rest = name.partition(".")
         if group == "conditions":
             part, field = rest.split(".")
             truth[name] = float(getattr(getattr(conditions, part), field))
+        elif group == "ultrasound":
+            field, _, place = rest.partition(".")
+            truth[name] = float(getattr(array, field)[int(place)] if place else getattr(array, field))
+        elif group == "clocks":
+            truth[name] = float(getattr(clocks, rest))
         elif group in Rig.model_fields:
             truth[name] = rig.number(name)
     return truth

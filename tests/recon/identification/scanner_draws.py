@@ -11,6 +11,7 @@ from recon.identification.wire_spread import Sightings
 from scenes.acoustics import TISSUES
 from scenes.tissue import Tissue
 from tests.twin.ultrasound.phantoms import down
+from twin.experiments.drawn_rig import draw_scanner
 from twin.ultrasound.bscan import scan
 from twin.ultrasound.echo_solids import Body, Wire
 from twin.ultrasound.transducer import Transducer
@@ -23,32 +24,9 @@ EMPTY = Tissue(1.5, 1540.0, 0.0, None)
 
 
 def drawn(seed: int) -> tuple[Transducer, float, np.random.Generator]:
-    """A scanner of a narrow image, and the attenuation of its phantom; rows short enough for its pulse."""
+    """A scanner, and the attenuation of its phantom."""
     rng = np.random.default_rng([seed, 77])
-    u = rng.uniform
-    frequency, depth = u(4, 12), u(30, 45)
-    row = min(u(0.04, 0.09), 0.77 / frequency)
-    band = u(0.4, 0.8)
-    array = Transducer(
-        image_size=(128, int(depth / row)),
-        scale_mm_per_px=(u(0.08, 0.14), row),
-        frequency_mhz=frequency,
-        bandwidth=(band, band * u(0.7, 1)),
-        transmit_focus_mm=u(12, 30),
-        transmit_f_number=u(1.8, 4),
-        receive_f_number=u(1.5, 4),
-        aperture_mm=u(12, 30),
-        elevation_mm=u(3, 7),
-        elevation_focus_mm=u(14, 30),
-        face_ring_mm=u(0.15, 0.5),
-        face_ring_db=u(-5, 8),
-        tgc_db_per_cm_mhz=u(0.3, 0.7),
-        gain_db=u(-35, -22),
-        noise_db=u(-70, -40),
-        dynamic_range_db=u(45, 80),
-        scatterers_per_mm3=64 * max(1, (frequency / 7.5) ** 2),
-    )
-    return array, u(0.4, 0.6), rng
+    return draw_scanner(rng), rng.uniform(0.4, 0.6), rng
 
 
 def recorded(array: Transducer, attenuation: float, seed: int, places: int = 8, steps: int = 14) -> Recordings:

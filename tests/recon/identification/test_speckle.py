@@ -27,3 +27,16 @@ def test_b_scans_of_the_same_tissue_are_one_part(rng):
     images = np.round(np.concatenate([grains[:2], grains[1:2] + rng.normal(0, 3, (1, 200, 90)), grains[2:]])).astype(np.uint8)
     part = speckle.parts(images, (0.1, 0.1))
     assert (part[1] == part[2]).all() and part.max() + 1 == 6
+
+
+def test_errors_of_places_are_those_of_their_distances(rng):
+    """A wrong scale errs by its share, a shift not at all, and one place's error by its part of the pairs."""
+    places = np.cumsum(rng.uniform(0.1, 0.3, 12).round(2))
+    places -= places[5]
+    distances = speckle.lags(places)[0]
+    alone = np.zeros(12)
+    alone[-1] = 0.02
+    found = speckle.lag_errors(places, np.array([0.03 * places, np.full(12, 0.4), alone]))
+    assert np.allclose(found[0], 0.03 * distances) and np.allclose(found[1], 0)
+    assert np.isclose(found[2][-1], 0.02) and 0 < found[2].mean() < 0.01
+    assert speckle.lag_errors(places, np.zeros((0, 12))).shape == (0, len(distances))

@@ -1,10 +1,12 @@
 """What is identified of a drawn rig is judged by its truth, in its own standard deviations."""
 
+import numpy as np
 import pytest
 
 from recon.identification.estimates import Estimate, Findings
 from twin.conditions import Conditions, Frames
 from twin.experiments import drawn_rig, identify_trial
+from twin.ultrasound.transducer import Transducer
 
 
 def test_errors_are_counted_in_their_sigmas(rig):
@@ -16,7 +18,7 @@ def test_errors_are_counted_in_their_sigmas(rig):
             "room.over_projector": Estimate(0.1, 0.1, "a test"),
         }
     )
-    truth = identify_trial.truth_of(rig, Conditions(frames=Frames(flicker=0.01)), found)
+    truth = identify_trial.truth_of(rig, Conditions(frames=Frames(flicker=0.01)), Transducer(), found)
     figures = identify_trial.judge(found, truth)
     assert (figures["measured"], figures["held"]) == (3, 2) and figures["held_share"] == pytest.approx(2 / 3)
     assert figures["projector_gamma_over_sigma"] == pytest.approx(-3)
@@ -38,9 +40,11 @@ def test_a_drawn_rig_is_identified_from_its_images(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(identify_trial, "POSES", 8)
     seed = 51
     drawn, conditions = drawn_rig.draw(rig, seed)
-    found_rig, found = identify_trial.identify_recorded(drawn, conditions, tmp_path, seed, seed)
-    figures = identify_trial.judge(found, identify_trial.truth_of(drawn, conditions, found))
-    assert figures["measured"] > 50 and figures["held_share"] >= 0.85
+    array = drawn_rig.draw_scanner(np.random.default_rng([seed, 61]))
+    drawn = identify_trial.with_scanner(drawn, array)
+    found_rig, found = identify_trial.identify_recorded(drawn, conditions, array, tmp_path, seed, seed)
+    figures = identify_trial.judge(found, identify_trial.truth_of(drawn, conditions, array, found))
+    assert figures["measured"] > 60 and figures["ultrasound_receive_f_number_over_sigma"] and figures["held_share"] >= 0.85
     assert max(abs(value) for name, value in figures.items() if name.endswith("_over_sigma")) < 6
     assert found_rig.cam1.optics.focal_px == pytest.approx(drawn.cam1.optics.focal_px, rel=1e-3)
     assert found_rig.projector.gamma == pytest.approx(drawn.projector.gamma, abs=0.05)
