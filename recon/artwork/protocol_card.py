@@ -89,7 +89,7 @@ STEPS = (
         "[the scanner](#the-scanner)",
         "Depth, gain and focus as in use; gel on a phantom without cysts; a micrometer moves the probe.",
         ("20 B-scans or more of speckle alone", "nothing is white all over"),
-        "session/us, any format of docs/freehand.md",
+        "session/us/tissue, session/us/air and session/us/steps, as images",
         False,
     ),
 )
@@ -189,7 +189,11 @@ def _content(width: float) -> list[Flowable]:
         Spacer(1, 8),
         Paragraph("Then", head),
         Paragraph(AFTER, code),
-        Paragraph("uses steps 1 to 5 as they lie in the folder, and says how well each number is known, or why it isn't.", plain),
+        Paragraph(
+            "uses steps 1 to 5 as they lie in the folder, those of step 6 by its fields tissue, air and steps, and says how well "
+            "each number is known, or why it isn't.",
+            plain,
+        ),
         Spacer(1, 8),
         Table(
             written,
