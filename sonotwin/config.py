@@ -190,11 +190,23 @@ def load(verb: str, overrides: Sequence[str], model: type[Model]) -> Model:
         One line that names the verb, the field, what was expected and what was found.
     """
     composed = compose(verb, overrides, model)
+    _leave_measured(composed.get("rig"), overrides)
     try:
         return model.model_validate(composed, context={"overrides": overrides})
     except ValidationError as error:
         text = describe(error, model, composed)
         raise InputError(f"{_source(verb, overrides, text.partition(':')[0])}: {text}") from error
+
+
+def _leave_measured(rig: Any, overrides: Sequence[str]) -> None:
+    """Leave out of a rig's measured numbers, in place, those that are given by hand."""
+    names = [override.lstrip("+~").partition("=")[0] for override in overrides]
+    parts = [name.removeprefix("rig.") for name in names if name.startswith("rig.")]
+    if isinstance(rig, dict) and rig.get("measured"):
+        kept = {
+            name: one for name, one in rig["measured"].items() if not any(f"{name}.".startswith(f"{part}.") for part in parts)
+        }
+        rig |= {"measured": kept} | ({"optics_covariance": None} if any(".optics" in part for part in parts) else {})
 
 
 def _source(verb: str, overrides: Sequence[str], field: str) -> str:

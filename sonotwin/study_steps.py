@@ -119,8 +119,9 @@ def search(config: "Config", goal: Goal, console: Console) -> bool:
             tried = rig_search.search(goal, read, config.first_seed, attempt)
         candidates.extend(progress.track(tried, goal.runs, description="candidates"))
     found = rig_search.best(candidates)
-    if len(candidates) < goal.runs:
-        console.print(f"tried       {len(candidates)}; none of the others is predicted to be better", markup=False)
+    if goal.by == "prediction" and len(candidates) < goal.runs:
+        rest = "none of the others is predicted to be better within bounds"
+        console.print(f"tried       {len(candidates)}; {rest}", markup=False)
     for what, one in {"start": candidates[0] if goal.start else None, "best": found}.items():
         if one is not None:
             console.print(f"{what:12}{goal.least} {shown(one.value, '.4g')}: {', '.join(fields_of(one.point))}", markup=False)

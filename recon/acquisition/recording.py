@@ -96,13 +96,16 @@ class Recording:
             self._tidy_surface()
 
     def add_frames(self, name: str, images: Mapping[str, Images]) -> None:
-        """Add images of no part, such as of covered lenses, or put them in the place of earlier ones.
+        """Add images of no part, such as of covered lenses, or put them in the place of earlier ones of the same cameras.
 
         images : folder below one of that name -> (n, h, w)
         """
-        with atomic.new_folder(self.folder / name, RECORD) as temporary:
-            for place, stack in images.items():
-                write_images([temporary / place / image_name(k) for k in range(len(stack))], stack)
+        for camera in {Path(place).parts[0] for place in images}:
+            own = {place: stack for place, stack in images.items() if Path(place).parts[0] == camera}
+            with atomic.new_folder(self.folder / name / camera, RECORD) as temporary:
+                for place, stack in own.items():
+                    folder = temporary / Path(place).relative_to(camera)
+                    write_images([folder / image_name(k) for k in range(len(stack))], stack)
 
     def add_pose(
         self,

@@ -1,6 +1,8 @@
 """Devices of a rig as they were calibrated: pinholes, lenses' distortion, and places."""
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from recon.geometry.camera import Camera
@@ -15,7 +17,7 @@ SOURCE = "calibration by a board"
 def with_devices(rig: Rig, calibration: Calibration) -> Rig:
     """The rig with its devices' optics as calibrated; cameras' nominal focal lengths follow by their pixels' size.
 
-    What was measured of these optics before doesn't count any more, nor does the covariance of all.
+    What was measured of these optics before doesn't count any more; other devices keep their covariance, as if independent.
     """
     changed = {}
     for name, camera in calibration.cameras.items():
@@ -29,20 +31,22 @@ def with_devices(rig: Rig, calibration: Calibration) -> Rig:
         changed[name] = device.model_copy(update=update)
     replaced = tuple(f"{name}.optics." for name in changed)
     kept = {name: one for name, one in rig.measured.items() if not name.startswith(replaced)}
-    return rig.model_copy(update=changed | {"measured": kept, "optics_covariance": _covariance(calibration)})
+    return rig.model_copy(update=changed | {"measured": kept, "optics_covariance": _covariance(calibration, rig)})
 
 
-def _covariance(calibration: Calibration) -> OpticsCovariance | None:
-    """Covariance as the rig's description has it, the scale's error included."""
-    if calibration.uncertainty is None:
+def _covariance(calibration: Calibration, rig: Rig) -> OpticsCovariance | None:
+    """Covariance as the rig's description has it, the scale's error included, and that of devices which weren't calibrated."""
+    before, blocks, names = rig.calibration().uncertainty, list[NDArray[np.float64]](), list[str]()
+    known = None if calibration.uncertainty is None else with_scale(calibration.uncertainty, calibration.cameras, None)
+    for part, devices in ((known, set(calibration.cameras)), (before, set(DEVICES) - set(calibration.cameras))):
+        if part is not None:
+            places = [k for k, name in enumerate(part.names) if name.partition(".")[0] in devices & set(DEVICES)]
+            blocks.append(part.covariance[np.ix_(places, places)])
+            names += [part.names[k] for k in places]
+    if not names:
         return None
-    known = with_scale(calibration.uncertainty, calibration.cameras, None)
-    assert known is not None
-    places = [k for k, name in enumerate(known.names) if name.partition(".")[0] in DEVICES]
-    rows = known.covariance[np.ix_(places, places)].tolist()
-    return OpticsCovariance(
-        names=tuple(known.names[k] for k in places), rows=tuple(tuple(row[: k + 1]) for k, row in enumerate(rows))
-    )
+    rows = block_diag(*blocks).tolist()
+    return OpticsCovariance(names=tuple(names), rows=tuple(tuple(row[: k + 1]) for k, row in enumerate(rows)))
 
 
 def optics_of(camera: Camera) -> Optics:

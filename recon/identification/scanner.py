@@ -126,7 +126,7 @@ def identify(recordings: Recordings, sheet: Sheet, settings: Settings = USUAL) -
     levels = _levels(recordings.tissue, rows, part, sheet)
     noise = None if recordings.air is None else air_levels(recordings.air, rows, sheet, levels.greys_a_db)
     uneven = unevenness_db(recordings.tissue, sheet, levels.greys_a_db, settings)
-    greys, raw = _greys(recordings.tissue, rows, part, levels, uneven, settings)
+    greys, why = _greys(recordings.tissue, rows, part, levels, uneven, settings)
     found |= greys
     beam, focus = along(recordings.tissue, part, sheet, _share(levels, noise, settings), settings)
     found |= beam
@@ -137,16 +137,16 @@ def identify(recordings: Recordings, sheet: Sheet, settings: Settings = USUAL) -
         share = _share(levels, noise, settings)
         placed = recordings.steps, recordings.steps_world_from_image, recordings.steps_errors_mm
         found |= across(*placed, sheet, share, found, settings)
-    if raw:
+    if not why:
         return found
     first = int(settings.face_mm / sheet.mm_per_px[1])
-    return _as_if_raw(found) | displayed_speckle.summary(recordings.tissue[:, first:], sheet.mm_per_px)
+    return _left_out(found, why) | displayed_speckle.summary(recordings.tissue[:, first:], sheet.mm_per_px)
 
 
-def _as_if_raw(found: Findings) -> Findings:
-    """What would be known if grains were raw speckle, as a reason each."""
-    why = "grains aren't raw speckle; if they were, it had come out as {:.3g}"
-    return Findings(unknown=found.unknown | {name: why.format(one.value) for name, one in found.estimates.items()})
+def _left_out(found: Findings, why: str) -> Findings:
+    """What would be known of even tissue with raw speckle, as a reason each."""
+    seen = {name: f"{why}; else it had come out as {one.value:.3g}" for name, one in found.estimates.items()}
+    return Findings(unknown=found.unknown | seen)
 
 
 def unevenness_db(images: Images, sheet: Sheet, greys_a_db: float, settings: Settings = USUAL) -> float:
@@ -193,28 +193,29 @@ def _share(levels: Levels, noise: Levels | None, settings: Settings) -> Callable
 
 def _greys(
     images: Images, rows: list[slice], part: NDArray[np.int64], levels: Levels, uneven_db: float, settings: Settings
-) -> tuple[Findings, bool]:
-    """The grey map, and whether grains may be raw: not skewed by other than the logarithm of an exponential power."""
+) -> tuple[Findings, str]:
+    """The grey map; and why nothing can be told, if tissue is uneven or grains aren't raw: skewed by other than a logarithm."""
     counts = grey_map.histograms(images, rows, part).sum(axis=0)
     clipped = (counts[:, 0] + counts[:, -1]) / counts.sum(axis=1)
     seen = clipped < settings.clipped
     name = "ultrasound.dynamic_range_db"
     if seen.sum() < 4:
-        return Findings(unknown={name: "too much of the tissue is black or white to see whether its grains are raw"}), True
+        return Findings(unknown={name: "too much of the tissue is black or white to see whether its grains are raw"}), ""
     if uneven_db > settings.uneven_db:
-        return Findings(
-            unknown={name: f"the tissue isn't even: its level differs by {uneven_db:.1f} dB from place to place"}
-        ), False
+        why = f"the tissue isn't even: its level differs by {uneven_db:.1f} dB from place to place"
+        return Findings(unknown={name: why}), "the tissue isn't even"
     skewed, raw = (grey_map.skewness(shares[seen]) for shares in (counts, levels.shares()))
     off = float((skewed - raw).mean())
     error = float((skewed - raw).std(ddof=1) / np.sqrt(seen.sum()))
     if abs(off) > max(settings.skew_off, settings.skew_sigmas * error):
         why = f"grains aren't raw speckle, or the grey map is bent: skewed by {skewed.mean():.2f}, not {raw.mean():.2f}; "
-        return Findings(unknown={name: why + f"if they were raw, a dB had {levels.greys_a_db:.2f} greys"}), False
+        return Findings(
+            unknown={name: why + f"if they were raw, a dB had {levels.greys_a_db:.2f} greys"}
+        ), "grains aren't raw speckle"
     widened = (uneven_db / speckle.SPREAD_DB) ** 2 / 2  # of the spread, by levels that differ
     relative = float(np.linalg.norm([np.sqrt(levels.covariance[0, 0]), settings.spread, widened]))
     source = f"spread of the greys of {len(images)} B-scans of even tissue"
-    return Findings({name: Estimate(levels.dynamic_range_db, levels.dynamic_range_db * relative, source)}), True
+    return Findings({name: Estimate(levels.dynamic_range_db, levels.dynamic_range_db * relative, source)}), ""
 
 
 def along(

@@ -311,6 +311,12 @@ class Rig(Part):
         parts = (getattr(self, name) for name in type(self).model_fields if name not in mappings)
         return hash((*parts, *(frozenset(getattr(self, name).items()) for name in mappings)))
 
+    def unmeasured(self, *parts: str) -> Self:
+        """The rig, of whose parts, such as `projector.optics`, no number counts as measured: they are about to be changed."""
+        kept = {name: one for name, one in self.measured.items() if not any(f"{name}.".startswith(f"{part}.") for part in parts)}
+        optics = any(part.endswith(".optics") for part in parts)
+        return self.model_copy(update={"measured": kept, **({"optics_covariance": None} if optics else {})})
+
     def number(self, name: str) -> float:
         """A number of the rig by its dotted name; KeyError if there is none."""
         value: Any = self

@@ -134,6 +134,9 @@ def _number_lines(rig: Comparison) -> list[str]:
 def _compared(rig: Comparison) -> str:
     """The files, and how many numbers of them."""
     over = f"; {rig.taken_over} taken over from the file" if rig.taken_over else ""
+    if rig.without_covariance:
+        named = ", ".join(TITLES.get(device, device) for device in rig.without_covariance)
+        over += f"; not compared, as a file has no covariance: optics of {named}"
     return f"{rig.today.text} against {rig.before.text}: {len(rig.numbers)} numbers, limit {rig.limit_sigma:.1f} σ{over}"
 
 

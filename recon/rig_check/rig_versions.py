@@ -80,6 +80,7 @@ class Comparison(Part):
     chance: Positive  # at most, of any being flagged of a rig that hasn't changed
     numbers: tuple[Number, ...] = Field(min_length=1)
     taken_over: int  # numbers that today's file has from the one before
+    without_covariance: tuple[str, ...] = ()  # devices whose optics were measured in both, and can't be compared
 
     @property
     def changed(self) -> tuple[Number, ...]:
@@ -109,6 +110,7 @@ def compare(before: Rig, today: Rig, drift_px: float, alarm_sigma: float) -> Com
     same = [name for name in own if _as_measured(before, name) == _as_measured(today, name)]
     found = [_one(before, today, name) for name in own if name not in same]
     found += _optics(before.calibration(), today.calibration(), drift_px)
+    lacking = tuple(device for device in DEVICES if _measured_without_covariance(device, before, today))
     if not found:
         told = f"{len(same)} that are the same" if same else "none"
         raise InputError(f"today: expected numbers that were measured anew, as in rig, found {told}")
@@ -118,12 +120,25 @@ def compare(before: Rig, today: Rig, drift_px: float, alarm_sigma: float) -> Com
     numbers = tuple(Number(name=name, sigma=sigma, changed=sigma > limit, change=change) for name, sigma, change in found)
     versions = [Version(version=one.version, identified=one.identified) for one in (before, today)]
     return Comparison(
-        before=versions[0], today=versions[1], limit_sigma=limit, chance=chance, numbers=numbers, taken_over=len(same)
+        before=versions[0],
+        today=versions[1],
+        limit_sigma=limit,
+        chance=chance,
+        numbers=numbers,
+        taken_over=len(same),
+        without_covariance=lacking,
     )
 
 
 def _is_optics(name: str) -> bool:
     return name.split(".")[:2] in [[device, "optics"] for device in DEVICES]
+
+
+def _measured_without_covariance(device: str, *rigs: Rig) -> bool:
+    """Whether optics of a device count as measured in all rigs, but not all know how their errors go together."""
+    known = [() if one.optics_covariance is None else one.optics_covariance.names for one in rigs]
+    covered = all(any(name.startswith(f"{device}.") for name in names) for names in known)
+    return not covered and all(any(name.startswith(f"{device}.optics.") for name in one.measured) for one in rigs)
 
 
 def _as_measured(rig: Rig, name: str) -> tuple[float, float, str]:

@@ -116,9 +116,12 @@ def shaken_point(capture: Path, sweep: str, rig: Rig) -> Array:
     """Point : (3,) mm in the target's frame whose shift is measured: the middle of the array in a sweep with B-scans, else of the
     circles.
     """
-    _, part = read_manifest(capture).sweep_of(capture / MANIFEST, "frames", sweep)
+    contents = read_manifest(capture)
+    _, part = contents.sweep_of(capture / MANIFEST, "frames", sweep)
     if SCANNER not in part.images:
         return circle_layout.middle(rig.target)
+    if contents.probe is not None:
+        return probe_files.read(capture / contents.probe).to_target([(rig.probe.image_size[0] - 1) / 2, 0.0])
     width_mm = rig.probe.scale_mm_per_px[0] * (rig.probe.image_size[0] - 1)
     return rigid.apply(rig.probe.target_from_image.matrix(), [width_mm / 2, 0.0, 0.0])
 

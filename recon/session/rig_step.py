@@ -21,7 +21,7 @@ from recon.capture.images import image_files, read_images
 from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError
-from recon.files import atomic
+from recon.files import atomic, yaml_text
 from recon.identification import calibrated_optics, lenses, projector, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur
@@ -111,14 +111,16 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     scans = (Path(name) for name in (settings.tissue, settings.air, settings.steps) if name)
     inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes, *scans)
     atomic.check_folder(out, BY, inputs=inputs)
+    _check_version(settings.rig, out / RIG)
     rig, found, scanned = identify(settings, watch)
     for line in describe(found):
         watch.say(line)
     name = read_manifest(settings.capture).name or settings.capture.resolve().name
-    rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
+    if any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
+        rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
         (
-            f"A rig as identified from {name}: numbers with an uncertainty (1 sigma) were measured,",
+            f"A rig as last identified from {name}: numbers with an uncertainty (1 sigma) were measured, there or before,",
             "others are as in the rig that it began with, or in its calibration. `sonotwin VERB rig=FILE` takes it.",
         )
     )
@@ -133,6 +135,13 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     watch.say(f"wrote       {out}/{{{','.join(written)}}}, version {rig.version} of the rig")
 
 
+def _check_version(rig: Rig, place: Path) -> None:
+    """Check that the file which identification begins with, if it is one, isn't lost: `check` compares later ones with it."""
+    if rig.version and place.is_file() and yaml_text.read(place).get("version") == rig.version:
+        found = f"found version {rig.version}, as of rig, which would be lost"
+        raise InputError(f"{place}: expected none, or another version of the rig, {found}; give another folder")
+
+
 def _day(path: Path) -> date:
     return datetime.fromtimestamp(path.stat().st_mtime, UTC).date()
 
@@ -142,11 +151,12 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings, 
     """The rig with what was measured in it, all that the captures show, and the scanner; raises InputError as `run` does."""
     manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
     seen = manifest.board is not None or manifest.surface is not None
-    for name in ("dark", "flat", "room"):
+    for name in ("dark", "flat", "room", "gain", "adc_bits"):
         if not seen and getattr(settings, name) is not None:
             raise InputError(f"{name}: expected a capture with a board or a surface under fringes beside it, found neither")
     scanned = scanner_step.identify(settings, settings.capture, manifest, settings.rig, watch)
-    if not (seen or scanned is not None or settings.still or settings.hand):
+    by_films = bool(settings.still or settings.hand or settings.probes)
+    if not (seen or scanned is not None or by_films):
         names = ", ".join(filter(None, manifest.named_sweeps))
         there = f"neither, but sweeps {names}; give tissue=NAME, still=[NAME] or hand=[NAME]" if names else "neither"
         raise InputError(f"{settings.capture}: expected a board or a surface under fringes, found {there}")
@@ -155,8 +165,8 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings, 
         rig, found = scanned.rig, found | scanned.findings
     if seen:
         rig, found = _optical(settings, manifest, rig, found, watch)
-    elif settings.still or settings.hand:
-        found |= _films(settings, None, watch)
+    elif by_films:
+        found |= _films(settings, rig, None, watch)
     return rig_file.apply(rig, found), found, scanned
 
 
@@ -187,13 +197,15 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
     if CAMERAS[0] in shots:
         with watch.busy("measuring the projector"):
             found |= _projector(CAMERAS[0], shots[CAMERAS[0]], rig, found, frames[CAMERAS[0]].room)
-    found |= _films(settings, None if board is None else calibration, watch)
+    found |= _films(settings, rig, None if board is None else calibration, watch)
     if settings.adc_bits is not None:
         sensors_of = {camera: getattr(rig, camera).sensor.model_copy(update={"adc_bits": settings.adc_bits}) for camera in frames}
         rig = rig.model_copy(
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
-    return rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)}), found
+    if "projector.lens.focus_mm" not in rig.measured:
+        rig = rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)})
+    return rig, found
 
 
 def _with_own_frames(settings: Settings) -> Settings:
@@ -242,10 +254,10 @@ def _file_of(calibration: Calibration | None, settings: Settings) -> Iterator[Pa
         yield file
 
 
-def _films(settings: Settings, calibration: Calibration | None, watch: Watch) -> Findings:
+def _films(settings: Settings, rig: Rig, calibration: Calibration | None, watch: Watch) -> Findings:
     """The tracker, the hand and the bracket; by a new calibration, if there is one."""
     with _file_of(calibration, settings) as file:
-        found = hand_step.identify(settings.capture, settings.rig, file, settings.still, settings.hand, watch)
+        found = hand_step.identify(settings.capture, rig, file, settings.still, settings.hand, watch)
     return found | hand_step.compare_probes(settings.probes)
 
 
@@ -310,8 +322,15 @@ def _lenses(captured: BoardCapture, optics: Result, rig: Rig, known: Findings) -
 def _black(camera: str, captured: BoardCapture, rig: Rig, known: Findings) -> Estimate:
     """A pixel without light, in DN of the board's images."""
     assumed = Estimate(getattr(rig, camera).sensor.black_level_dn, BLACK_SIGMA_DN, "assumed")
-    one, deeper = known.estimates.get(f"{camera}.sensor.black_level_dn", assumed), 2.0 ** (captured.devices[camera].bits - 8)
+    one, deeper = _known(f"{camera}.sensor.black_level_dn", rig, known) or assumed, 2.0 ** (captured.devices[camera].bits - 8)
     return Estimate(deeper * one.value, deeper * one.sigma, one.source)
+
+
+def _known(name: str, rig: Rig, found: Findings) -> Estimate | None:
+    """A number of the rig as it was measured, now or before."""
+    before = rig.measured.get(name)
+    earlier = None if before is None else Estimate(rig.number(name), before.sigma, before.source)
+    return found.estimates.get(name, earlier)
 
 
 def _agreed(first: Mapping[str, Estimate], second: Mapping[str, Estimate]) -> dict[str, Estimate]:
@@ -342,13 +361,12 @@ def _projector(camera: str, shot: SurfaceCapture, rig: Rig, found: Findings, roo
 
 def _blur(camera: str, rig: Rig, found: Findings) -> CameraBlur:
     """A camera's blur as measured, or a point spread as the rig has it."""
-    lens, known = getattr(rig, camera).lens, found.estimates
-    names = [f"{camera}.lens.{name}" for name in ("f_number", "focus_mm")]
-    if not all(name in known for name in names):
+    lens = getattr(rig, camera).lens
+    number, focus, point = (_known(f"{camera}.lens.{name}", rig, found) for name in ("f_number", "focus_mm", "blur_px"))
+    if number is None or focus is None:
         return CameraBlur(lens.blur_px, BLUR_SIGMA_PX[1])
-    point = known.get(f"{camera}.lens.blur_px", Estimate(lens.blur_px, BLUR_SIGMA_PX[0], "assumed"))
-    number, focus = (known[name].value for name in names)
-    return CameraBlur(point.value, point.sigma, lens.focal_length_mm / number, focus)
+    point = point or Estimate(lens.blur_px, BLUR_SIGMA_PX[0], "assumed")
+    return CameraBlur(point.value, point.sigma, lens.focal_length_mm / number.value, focus.value)
 
 
 def _stack(folder: Path | None, camera: str, device: Device) -> Images | None:

@@ -11,7 +11,7 @@ something has moved or changed. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
-    sonotwin check today=outputs/today out=outputs/check log=outputs/rig.jsonl
+    sonotwin check rig=outputs/ours/rig.yaml today=outputs/today out=outputs/check log=outputs/rig.jsonl
 """
 
 from collections.abc import Collection, Sequence

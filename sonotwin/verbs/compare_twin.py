@@ -14,11 +14,13 @@ can be tried by its name, such as rig.projector.gamma=2.2.
     sonotwin compare-twin capture=outputs/sphere/capture rig.projector.gamma=2.0 out=outputs/another_gamma
 """
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
+from recon.capture.manifest import read_manifest
 from recon.files import atomic, metrics
 from recon.model.part import Part
 from recon.model.rig import Rig
@@ -61,9 +63,11 @@ def run(config: Config) -> None:
     inputs = (config.capture, config.identified_from)
     atomic.check_folder(config.out, BY, inputs=inputs)
     found = rerendering.rerender(config.capture, config.rig, config.conditions, config.camera, config.tracing, config.seed, watch)
-    name = config.capture.resolve().name
+    name = read_manifest(config.capture).name or config.capture.resolve().name
     with watch.busy("writing the page"), atomic.new_folder(config.out, BY) as new:
-        likeness_report.write(new / REPORT, found.real, found.twin, found.likeness, name, source_of(config), [command_of(config)])
+        likeness_report.write(
+            new / REPORT, found.real, found.twin, found.likeness, name, source_of(config, name), [command_of(config)]
+        )
         figures = likeness_report.metrics_of(found.likeness) | {"room_lux": found.room_lux}
         metrics.write(new / metrics.FILE, figures)
     for line in likeness_report.unexplained(found.real, found.likeness):
@@ -71,19 +75,23 @@ def run(config: Config) -> None:
     watch.say(f"wrote       {config.out}/{{{REPORT},{metrics.FILE}}}")
 
 
-def source_of(config: Config) -> str:
-    """A sentence on the data that the rig is from."""
+def source_of(config: Config, name: str) -> str:
+    """A sentence on the data that the rig is from; name: of the capture."""
     measured = len(config.rig.measured)
     if not measured:
         return "None of the rig’s numbers was measured: this compares a description with a capture."
-    other = config.identified_from is not None and config.identified_from.resolve() != config.capture.resolve()
-    if other:
+    other = None if config.rig.identified is None else config.rig.identified.capture
+    if config.identified_from is not None:
+        other = name if config.identified_from.resolve() == config.capture.resolve() else str(config.identified_from)
+    if other not in (None, name):
         known = f"The rig’s {measured} measured numbers are from another capture"
-        return f"{known}, {config.identified_from}: this one is new to the rig, and agreement is a prediction that came true."
+        return f"{known}, {other}: this one is new to the rig, and agreement is a prediction that came true."
     known = f"{measured} of the rig’s numbers were measured, by all of this capture as far as is known here"
     return f"{known}: agreement says that the rig’s model fits, not that it predicts. identified_from names another capture."
 
 
 def command_of(config: Config) -> str:
-    """The command, but for the rig and conditions, whose files aren't known any more."""
-    return f"sonotwin compare-twin capture={config.capture} rig=rig.yaml conditions=conditions.yaml out={config.out}"
+    """The command; files of the rig and conditions, and fields of the tracing, aren't known any more."""
+    names = ("capture", "identified_from", "camera", "seed", "out")
+    given = [f"{name}={value}" for name in names if (value := getattr(config, name)) is not None]
+    return f"sonotwin compare-twin rig=rig.yaml conditions=conditions.yaml {shlex.join(given)}"

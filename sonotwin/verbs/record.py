@@ -212,8 +212,9 @@ def check_place(config: Config, recording: Recording) -> None:
         raise InputError(f"{recording.folder}: surface: expected none yet, {found}; give another out=FOLDER, or replace=true")
     if config.part in get_args(Kind):
         exposures(config, recording)
-        if (place := recording.folder / config.part).is_dir() and not config.replace:
-            raise InputError(f"{place}: expected none yet, found a folder; give another out=FOLDER, or replace=true")
+        for place in (recording.folder / config.part / camera for camera in config.cameras):
+            if place.is_dir() and not config.replace:
+                raise InputError(f"{place}: expected none yet, found a folder; give another out=FOLDER, or replace=true")
 
 
 def exposures(config: Config, recording: Recording) -> dict[str, Device]:
@@ -229,6 +230,14 @@ def exposures(config: Config, recording: Recording) -> dict[str, Device]:
             )
     expected = f"expected a surface or a board, as {config.part} frames are exposed"
     raise InputError(f"{recording.folder / MANIFEST}: {expected}, found neither; record part=surface first")
+
+
+def check_bits(plan: FramesPlan, opened: Opened, recording: Recording) -> None:
+    """Check that frames will have the bits of the images that they belong to; InputError else."""
+    for name, device in plan.devices.items():
+        if (bits := opened.cameras[name].bits) != device.bits:
+            expected = f"expected {device.bits}, as {name} took {recording.folder}"
+            raise InputError(f"devices.bits: {expected}, found {bits}: {plan.kind} frames are compared with it")
 
 
 @contextmanager
@@ -249,7 +258,7 @@ def shown(config: Config, console: Console) -> Iterator[tuple[Say, Show]]:
 
 
 def still(config: Config, recording: Recording, console: Console, say: Say, show: Show) -> None:
-    """Record a board or a surface."""
+    """Record a board, a surface, or frames."""
     patterns = list(projected_images.images(config.patterns))
     if config.part == "surface" and recording.contents.surface:
         say(f"replaces the surface of {recording.surface_day}, which stays until the new one is whole")
@@ -267,6 +276,7 @@ def still(config: Config, recording: Recording, console: Console, say: Say, show
             say(f"kept {config.patterns.count} images of {' and '.join(opened.cameras)}" if kept else "nothing kept")
         elif config.part in ("dark", "flat", "room"):
             plan = FramesPlan(config.part, exposures(config, recording))
+            check_bits(plan, opened, recording)
             kept = record_frames(recording, stage, operator, plan, say, show)
             say(f"kept frames of {' and '.join(opened.cameras)}" if kept else "nothing kept")
         else:

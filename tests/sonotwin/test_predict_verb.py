@@ -23,6 +23,8 @@ def test_measured_numbers_give_an_interval(tmp_path, capsys):
     rig_file.write(tmp_path / "ours.yaml", rig, {}, "a test")
     assert main(["predict", f"rig={tmp_path / 'ours.yaml'}"]) == 0
     assert "mm (95 %, by 1 measured numbers, if all others" in capsys.readouterr().out
+    assert main(["predict", f"rig={tmp_path / 'ours.yaml'}", "rig.cam1.sensor.saturation_e=9000"]) == 0
+    assert "none of the rig's numbers was measured" in capsys.readouterr().out, "as it was given by hand"
 
 
 def test_sessions_tell_errors_of_points_b_scans_and_masses(capsys):

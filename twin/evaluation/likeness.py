@@ -352,7 +352,11 @@ def _as_blurred(found: NDArray[np.complex128] | None, patterns: Patterns, edges:
     """The twin's harmonics behind a blur by which edges are as wide as the real ones: blur takes finer waves most."""
     if found is None or edges is None:
         return found
-    pitch = next(part.pitch for part in patterns.parts if isinstance(part, Fringes) and (part.steps - 1) // 2 >= 2)
+    pitch = next(
+        part.pitch
+        for part in patterns.parts
+        if isinstance(part, Fringes) and part.waveform == "sine" and (part.steps - 1) // 2 >= 2
+    )
     passed = [[passed_by(edges.place, light, pitch / k) for k in range(1, len(found) + 2)] for light in edges[1:]]
     ours, theirs = (np.array(one[1:]) / one[0] for one in passed)
     known = theirs > LEAST_PASSED

@@ -23,7 +23,9 @@ def draw(rig: Rig, seed: int) -> tuple[Rig, Conditions]:
     cameras = {name: _camera(getattr(rig, name), size, pixel_um, adc_bits, rng) for name in ("cam1", "cam2")}
     projector = _projector(rig.projector, PROJECTOR_SIZES[rng.integers(len(PROJECTOR_SIZES))], rng)
     frames = Frames(flicker=rng.uniform(0.002, 0.02), stray_dn=rng.uniform(0.1, 1.0), shift=rng.uniform(0.002, 0.05))
-    return rig.model_copy(update={**cameras, "projector": projector}), Conditions(frames=frames)
+    return rig.model_copy(update={**cameras, "projector": projector, "measured": {}, "optics_covariance": None}), Conditions(
+        frames=frames
+    )
 
 
 def draw_scanner(rng: np.random.Generator) -> Transducer:

@@ -51,8 +51,8 @@ def plate_of(settings: Settings, seed: int) -> plane.Config:
 
 
 def predict(settings: Settings, seed: int) -> Metrics:
-    """Those figures of the same plane that formulas give; errors of frames and drift aren't in them."""
-    rig, patterns = laid_out(settings.rig, settings.layout), settings.patterns
+    """Those figures of the same plane that formulas give; errors of frames, drift and calibration aren't in them."""
+    rig, patterns = laid_out(settings.rig, settings.layout).model_copy(update={"optics_covariance": None}), settings.patterns
     found = predicted_plane.predict(rig, Measurement(patterns, plate_of(settings, seed), settings.shooting, settings.tracing))
     return {
         "plane_rms_mm": found.rms_mm,

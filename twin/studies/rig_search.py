@@ -168,6 +168,8 @@ def search_by_prediction(
     known = goal.model_copy(update={"bounds": {name: bound for name, bound in goal.bounds.items() if name in figures}})
     judgements = [judged(known, factors, point, predicted[number]) for number, point in enumerate(points)]
     likely = sorted((one for one in judgements if one.excess <= CLOSE and math.isfinite(one.value)), key=lambda one: one.value)
+    if not (likely or goal.start):
+        raise InputError("search: bounds: expected some that a candidate is predicted to keep, found none that does")
     if goal.start:
         likely = [one for one in likely if one.point != goal.start]
         likely.insert(0, judged(known, factors, goal.start, foresee([goal.start])[0]))
@@ -175,7 +177,7 @@ def search_by_prediction(
     for first in range(0, min(len(likely), goal.runs), goal.batch):
         batch = likely[first : min(first + goal.batch, goal.runs)]
         found = best(tried)
-        if found is not None and min(ratios) * min(one.value for one in batch) > found.value:
+        if found is not None and ratios and min(ratios) * min(one.value for one in batch) > found.value:
             return
         for one, done in zip(batch, attempt([one.point for one in batch]), strict=True):
             tried.append(judged(goal, factors, one.point, done))

@@ -270,3 +270,5 @@ def test_predictions_that_are_all_out_of_bounds_leave_the_start():
     goal = GOAL.model_copy(update={"bounds": {"time": Bound(most=1e-6)}, "by": "prediction"})
     foresee = attempt
     assert [one.point for one in rig_search.search_by_prediction(goal, OVER, foresee, attempt)] == [START]
+    with pytest.raises(InputError, match="bounds: expected some that a candidate is predicted to keep"):
+        list(rig_search.search_by_prediction(goal.model_copy(update={"start": {}}), OVER, foresee, attempt))
