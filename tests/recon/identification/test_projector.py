@@ -37,7 +37,8 @@ def test_gamma_and_errors_of_frames_are_found(rig, rng):
     """Each within 3.5 of its standard deviations; gamma to 0.02, however blurred its harmonics are."""
     found, truth = identified(rig, rng)
     assert found.estimates["projector.gamma"].sigma < 0.02
-    for name, one in found.estimates.items():
+    for name in truth.keys() & found.estimates.keys():
+        one = found.estimates[name]
         assert abs(one.value - truth[name]) < 3.5 * one.sigma, name
     assert found.estimates.keys() | found.unknown.keys() >= truth.keys()
 
@@ -48,7 +49,7 @@ def test_intervals_of_drawn_projectors_hold_what_they_say(rig, rng):
     off, lenses = [], 0
     for _ in range(5):
         found, truth = identified(rig, rng)
-        off += [(one.value - truth[name]) / one.sigma for name, one in found.estimates.items()]
+        off += [(one.value - truth[name]) / one.sigma for name, one in found.estimates.items() if name in truth]
         lenses += "projector.lens.focus_mm" in found.estimates
     held = np.mean(np.abs(off) < 1.96)
     assert held > 0.95 - 3 * np.sqrt(0.95 * 0.05 / len(off)) and np.std(off) > 0.5 and lenses >= 3
@@ -59,7 +60,8 @@ def test_three_pitches_show_the_same(rig, rng):
     """Without a code: each number within 3.5 of its standard deviations."""
     found, truth = identified(rig, rng, "multi_frequency")
     assert {"projector.gamma", "conditions.frames.flicker"} <= found.estimates.keys()
-    for name, one in found.estimates.items():
+    for name in truth.keys() & found.estimates.keys():
+        one = found.estimates[name]
         assert abs(one.value - truth[name]) < 3.5 * one.sigma, name
 
 

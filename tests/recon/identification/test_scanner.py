@@ -44,7 +44,7 @@ def test_smoothed_grains_leave_the_dynamic_range_unknown(usual):
     assert "raw speckle" in found.unknown["ultrasound.dynamic_range_db"] and found.estimates.keys() == {
         f"speckle.{name}" for name in ("contrast", "deep_mm", "along_mm")
     }
-    assert "if they were, it had come out as" in found.unknown["ultrasound.receive_f_number"]
+    assert "aren't raw speckle; else it had come out as" in found.unknown["ultrasound.receive_f_number"]
 
 
 def test_without_tissue_little_is_known(usual):
