@@ -139,8 +139,20 @@ def predict(found: Displayed, mm_per_px: tuple[float, float]) -> Figures:
     return Figures(mean, np.sqrt(spreads) / mean, np.array(deep), np.array(along), shares)
 
 
-def line_spacing_px(images: Images, least: float = 8.0) -> float | None:
+def line_spacing_px(images: Images) -> float | None:
     """Distance, px, of a linear array's lines whose columns between are interpolated, by B-scans : (n, h, w); None if none shows.
+
+    Both halves of the images must show it: smoothed grains bend with a period by chance, each time another one.
+    """
+    halves = [_bending_period_px(images[first::2]) for first in (0, 1)] if len(images) > 1 else [None]
+    known = [one for one in halves if one is not None]
+    if len(known) < len(halves) or np.ptp(known) > max(known) ** 2 / images.shape[2]:
+        return None
+    return float(np.mean(known))
+
+
+def _bending_period_px(images: Images, least: float = 8.0) -> float | None:
+    """Period with which rows bend.
 
     least : power of their rise and fall, over the strongest expected of as many columns without lines; 1 to 2 without
 

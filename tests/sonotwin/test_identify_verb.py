@@ -64,7 +64,7 @@ def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsy
         assert found["estimates"][name]["source"] == known.source
     assert "measured    cam1.sensor: " in said and "unknown     cam1.sensor.quantum_efficiency: " in said
     text = (tmp_path / "ours" / "rig.yaml").read_text()
-    assert text.startswith("# A rig as identified from capture") and "# not measured: " in text
+    assert text.startswith("# A rig as last identified from capture") and "# not measured: " in text
     conditions = (tmp_path / "ours" / "conditions.yaml").read_text()
     assert "defaults:\n- ideal\n" in conditions and "flicker" in conditions
 

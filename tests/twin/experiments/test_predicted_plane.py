@@ -27,12 +27,12 @@ def measurement(rig, **fields) -> Measurement:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [201, 202])
-def test_a_rendered_plane_is_as_far_off_as_is_predicted(rig, seed):
-    """Of rigs drawn at random, within 5 %, and so are exposures, which are set for the brightest places.
+def test_a_rendered_plane_is_as_far_off_as_is_predicted(rig):
+    """Of a rig drawn at random, within 5 %, and so are exposures, which are set for the brightest places.
 
     By many samples: of a coarse raster, nearly in focus, 16 leave 0.05 projector px of noise of their own, 64 half of it.
     """
+    seed = 202
     drawn, _ = drawn_rig.draw(rig, seed)
     chosen = measurement(drawn)
     found = surface_accuracy.experiment(drawn, plane.build(chosen.plate), chosen.patterns, seed, chosen.tracing)
