@@ -3,11 +3,11 @@
 Reads a capture folder with the calibrations in use and any of three parts, taken before a session in two minutes: a film in which
 both cameras see the target moved about, tilted to all sides; a fringe sequence of anything smooth, seen by both cameras, best
 with fringes along both axes; and ten seconds of tracked B-scans over a flat, rough bottom in water, the probe rolled, tilted and
-moved up and down. With `today=FOLDER`, the folder that `sonotwin identify` made of today's captures, its numbers are compared with those
-of `rig`, the file of an earlier one; without a capture they alone are. Writes into the folder `out` check.html, the verdicts with
-their course over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual drift,
-are no alarm; where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit status 1 if
-something has moved or changed. Takes some seconds.
+moved up and down. With `today=FOLDER`, that `sonotwin identify` made of today's captures, its numbers are compared with those of
+the file of an earlier one, `rig=FILE`; without a capture they alone are. Writes into the folder `out` check.html, the verdicts
+with their course over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual
+drift, are no alarm; where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit
+status 1 if something has moved or changed. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
