@@ -3,9 +3,8 @@
 `part=board` draws the board of the field `board`, of any kind that `calibrate-optics` finds; `part=target` draws the rings of
 `rig.target`, or of another `body` of the rig. `family=3` draws three targets, a page each, of which none is taken for another,
 and prints the lines that describe all but the first as bodies of a rig. Around the card to cut out are cut marks, a ruler of
-100 mm along each axis, and its lengths in small print. `part=protocol` is a page for whoever records a rig that `sonotwin
-identify` is to measure: six steps, with what is to be seen at each. Writes the file `out`; one that is there is replaced. Takes a
-second.
+100 mm along each axis, and its lengths in small print. `part=protocol` is a page for whoever records a rig that `identify` is to
+measure: six steps, with what is to be seen at each. Writes the file `out`; one that is there is replaced. Takes a second.
 
 Print boards and targets at 100 %, measure both rulers, and where they aren't 100.0 mm long, give the lengths as they are on paper
 wherever board or target are described: docs/calibration.md says how.
