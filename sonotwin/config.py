@@ -30,6 +30,7 @@ from pydantic_core import to_jsonable_python
 from recon.errors import InputError, brief, did_you_mean, one_line, short
 from recon.files import yaml_text
 from recon.model.part import Kinds
+from recon.model.rig import without_measures
 from recon.registry import Choice
 
 OF_SOME_VERBS = {  # choices of a group that only these verbs take
@@ -203,10 +204,7 @@ def _leave_measured(rig: Any, overrides: Sequence[str]) -> None:
     names = [override.lstrip("+~").partition("=")[0] for override in overrides]
     parts = [name.removeprefix("rig.") for name in names if name.startswith("rig.")]
     if isinstance(rig, dict) and rig.get("measured"):
-        kept = {
-            name: one for name, one in rig["measured"].items() if not any(f"{name}.".startswith(f"{part}.") for part in parts)
-        }
-        rig |= {"measured": kept} | ({"optics_covariance": None} if any(".optics" in part for part in parts) else {})
+        rig |= without_measures(rig, parts)
 
 
 def _source(verb: str, overrides: Sequence[str], field: str) -> str:

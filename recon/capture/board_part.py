@@ -103,7 +103,7 @@ def read_board(folder: Path) -> BoardCapture:
     read = manifest.read_manifest(folder)
     if read.board is None:
         raise InputError(f"{folder / MANIFEST}: expected board, the poses of a calibration board, found none")
-    part, name = read.board, read.name or folder.resolve().name
+    part, name = read.board, read.name_of(folder)
     capture = BoardCapture(folder / read.root, name, read.devices_of("board"), part.board, part.patterns, part.poses)
     check_there(path for number in range(len(part.poses)) for path in capture.paths(number))
     return capture

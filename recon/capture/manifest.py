@@ -182,6 +182,10 @@ class Manifest(rig.Part):
     sweep: SweepPart | None = None  # the only one
     sweeps: dict[SweepName, SweepPart] = Field(default_factory=dict)  # or several, in the order in which they were taken
 
+    def name_of(self, folder: Path) -> str:
+        """The capture's name: its own, or that of its folder."""
+        return self.name or folder.resolve().name
+
     @model_validator(mode="after")
     def _one_or_named(self) -> "Manifest":
         if self.sweep is not None and self.sweeps:

@@ -96,7 +96,7 @@ def read_film(folder: Path, calibration_file: Path | None = None, sweep: str = "
     tables = [sweep_tables.read_stamps(place / STAMPS) for place in places]
     first, second = _partners(places, tables)
     frames = np.column_stack([tables[0][0][first], tables[1][0][second]])
-    name, folders = read.name or folder.resolve().name, (places[0], places[1])
+    name, folders = read.name_of(folder), (places[0], places[1])
     film = Film(name, cameras, known.uncertainty, depths, folders, frames, tables[0][1][first])
     check_there(path for both in film.paths() for path in both)
     return film

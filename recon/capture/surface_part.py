@@ -46,7 +46,7 @@ def read_surface(folder: Path, camera: str = "cam1", calibration_file: Path | No
     optics = calibration_files.read_for(manifest.calibration_file(folder, calibration_file), sizes)
     root = folder / manifest.root
     images = read_images([root / path for path in manifest.surface.images[camera]], device.size, device.bits)
-    return SurfaceCapture(images, manifest.surface.patterns, device.bits, optics, manifest.name or folder.resolve().name)
+    return SurfaceCapture(images, manifest.surface.patterns, device.bits, optics, manifest.name_of(folder))
 
 
 def cameras_beside(folder: Path, camera: str) -> list[str]:

@@ -132,7 +132,7 @@ def read_sweep(folder: Path, name: str = "", purpose: Purpose | None = None, imp
     track, left_out = _believed(listed, sweep_tables.read_track(listed), paths, times, device.size, implausible)
     probe = None if read.probe is None else probe_files.read(folder / read.probe)
     bodies = {body: sweep_tables.read_track(root / path) for body, path in (part.bodies or {}).items()}
-    return SweepCapture(read.name or folder.resolve().name, device.size, paths, frames, times, track, probe, left_out, bodies)
+    return SweepCapture(read.name_of(folder), device.size, paths, frames, times, track, probe, left_out, bodies)
 
 
 def _believed(

@@ -29,9 +29,8 @@ def with_devices(rig: Rig, calibration: Calibration) -> Rig:
             length = float(camera.matrix[0, 0]) * device.sensor.pixel_um * 1e-3
             update["lens"] = device.lens.model_copy(update={"focal_length_mm": length})
         changed[name] = device.model_copy(update=update)
-    replaced = tuple(f"{name}.optics." for name in changed)
-    kept = {name: one for name, one in rig.measured.items() if not name.startswith(replaced)}
-    return rig.model_copy(update=changed | {"measured": kept, "optics_covariance": _covariance(calibration, rig)})
+    known = {"optics_covariance": _covariance(calibration, rig)}
+    return rig.unmeasured(*(f"{name}.optics" for name in changed)).model_copy(update=changed | known)
 
 
 def _covariance(calibration: Calibration, rig: Rig) -> OpticsCovariance | None:

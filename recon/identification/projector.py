@@ -45,11 +45,11 @@ FRAMES = np.array([0.02, 1.0, 0.05])  # standard deviations of gains, offsets in
 MOST_FRAMES = np.array([0.2, 20.0, 0.2])
 LEAST_FRAMES = np.array([1e-5, 1e-3, 1e-5])
 LENS = [BLUR, APERTURE, VERGENCE]
-SEEN = (
+SEEN = (  # the whole blur, a part of it, where
     "surface.projector_blur_px",
     "surface.projector_point_spread_px",
     "surface.depth_mm",
-)  # the whole blur, a part of it, where
+)
 LENS_ERROR = 1.25  # of their standard deviations: 25 renders of a plane, a sphere and a breast left z-scores of 1.1 to 1.4
 LEAST_BLUR_ERROR_PX = 0.01  # the mean error in the same renders, most on the sphere: a pixel's view of what is bent
 LOOSE = 5.0  # standard deviations of the decoded coordinate, of a prior around it: it costs a 25th of its information

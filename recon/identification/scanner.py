@@ -61,9 +61,7 @@ class Recordings:
     air: Images | None = None  # of the probe in air
     steps: Images | None = None  # of even tissue, a fraction of the slice apart
     steps_world_from_image: Array | None = None  # (n, 4, 4) mm, their poses
-    steps_errors_mm: Array | None = (
-        None  # (q, n) of their places across the plane: q independent errors of one standard deviation
-    )
+    steps_errors_mm: Array | None = None  # (q, n) of places across the plane: q independent errors of 1 sigma
 
 
 @dataclass(frozen=True)
@@ -82,10 +80,8 @@ class Settings:
     seen: float = 0.4  # of what was assumed beforehand: parameters known no better than by this are unknown
     relative: float = 0.3  # worse than by this, they are unknown
     clipped: float = 0.15  # share of black and white pixels in bands that show it, at most
-    skew_off: float = (
-        0.06  # of greys' skewness from that of raw speckle, beyond which grains aren't raw: 12 drawn scanners were off
-    )
-    skew_sigmas: float = 4.0  # by 0.023 at most; standard deviations by bands. Smoothed over half a column it is off by 0.15
+    skew_off: float = 0.06  # of greys' skewness from raw speckle's, beyond which grains aren't raw; raw ones: 0.023 at most
+    skew_sigmas: float = 4.0  # the same in standard deviations by bands; smoothed over half a column, it is off by 0.15
     nonblack: float = 0.02  # share of pixels, under which noise is below the last grey
     uneven_db: float = 2.0  # of the tissue's level from place to place, beyond which it isn't even
 

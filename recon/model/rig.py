@@ -3,7 +3,7 @@
 World is the frame of camera 1. Every field has a unit; nonsense is refused with the field's name.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date
 from itertools import combinations, islice, permutations
 from typing import Annotated, Any, ClassVar, Self
@@ -291,6 +291,20 @@ class OpticsCovariance(Part):
 BodyName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 
 
+def without_measures(fields: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
+    """A rig's `measured` and `optics_covariance`, less what they have of parts, such as `projector.optics`, by dotted names.
+
+    Errors of all optics go together, so the covariance of all is lost with that of one.
+    """
+
+    def within(name: str) -> bool:
+        return any(f"{name}.".startswith(f"{part}.") for part in parts)
+
+    optics = any(within(f"{device}.optics") or part.startswith(f"{device}.optics.") for device in DEVICES for part in parts)
+    kept = {name: one for name, one in fields["measured"].items() if not within(name)}
+    return {"measured": kept, "optics_covariance": None if optics else fields.get("optics_covariance")}
+
+
 class Rig(Part):
     """The whole rig: two cameras, the projector, the probe with its target, and further bodies with a target each."""
 
@@ -313,9 +327,8 @@ class Rig(Part):
 
     def unmeasured(self, *parts: str) -> Self:
         """The rig, of whose parts, such as `projector.optics`, no number counts as measured: they are about to be changed."""
-        kept = {name: one for name, one in self.measured.items() if not any(f"{name}.".startswith(f"{part}.") for part in parts)}
-        optics = any(part.endswith(".optics") for part in parts)
-        return self.model_copy(update={"measured": kept, **({"optics_covariance": None} if optics else {})})
+        fields = {"measured": self.measured, "optics_covariance": self.optics_covariance}
+        return self.model_copy(update=without_measures(fields, parts))
 
     def number(self, name: str) -> float:
         """A number of the rig by its dotted name; KeyError if there is none."""

@@ -112,7 +112,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     with atomic.new_folder(out, BY) as folder:
         calibration_files.write(folder / OPTICS, found.calibration)
         metrics.write(folder / metrics.FILE, found.figures)
-        (folder / PAGE).write_text(write_page(found, held.name or settings.capture.resolve().name), encoding="utf-8")
+        (folder / PAGE).write_text(write_page(found, held.name_of(settings.capture)), encoding="utf-8")
     watch.say(f"wrote       {out}/{{{OPTICS},{PAGE},{metrics.FILE}}}")
 
 

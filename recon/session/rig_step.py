@@ -115,7 +115,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     rig, found, scanned = identify(settings, watch)
     for line in describe(found):
         watch.say(line)
-    name = read_manifest(settings.capture).name or settings.capture.resolve().name
+    name = read_manifest(settings.capture).name_of(settings.capture)
     if any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
         rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
     heading = "\n".join(

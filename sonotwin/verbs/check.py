@@ -158,7 +158,7 @@ def checked(config: Config, capture: Path, watch: ConsoleWatch) -> tuple[str, li
         watch.say(line)
     devices, corrected = optics(config, capture, listed, held, watch)
     found = [*devices, *verdicts.doubted(tank(config, capture, held, watch), devices)]
-    return listed.name or capture.resolve().name, found, corrected
+    return listed.name_of(capture), found, corrected
 
 
 def parts_of(config: Config, capture: Path, listed: Manifest, tracked: Manifest) -> Held:

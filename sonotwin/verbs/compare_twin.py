@@ -63,7 +63,7 @@ def run(config: Config) -> None:
     inputs = (config.capture, config.identified_from)
     atomic.check_folder(config.out, BY, inputs=inputs)
     found = rerendering.rerender(config.capture, config.rig, config.conditions, config.camera, config.tracing, config.seed, watch)
-    name = read_manifest(config.capture).name or config.capture.resolve().name
+    name = read_manifest(config.capture).name_of(config.capture)
     with watch.busy("writing the page"), atomic.new_folder(config.out, BY) as new:
         likeness_report.write(
             new / REPORT, found.real, found.twin, found.likeness, name, source_of(config, name), [command_of(config)]

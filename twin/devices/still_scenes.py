@@ -64,11 +64,16 @@ class EvenLight:
 
     def radiance(self, camera: CameraName, shown: Pattern) -> NDArray[np.float32]:
         """What arrives at a camera's pixels : (h, w), W/mm^2/sr, a fifth less in one corner."""
-        device = getattr(self.rig, camera)
-        width, height = device.optics.size
-        slope = np.linspace(1.0, 0.9, width) * np.linspace(1.0, 0.9, height)[:, None]
-        electrons = electrons_per_radiance(device, self.rig.projector.wavelength_nm) * 0.01
-        return np.float32(slope * self.level * device.sensor.saturation_e / electrons)
+        return even_radiance(self.rig, camera, self.level, 0.01)
+
+
+def even_radiance(rig: Rig, camera: CameraName, level: float, seconds: float) -> NDArray[np.float32]:
+    """Light : (h, w) W/mm^2/sr that falls by a fifth towards one corner; in so many seconds a share `level` saturates a pixel."""
+    device = getattr(rig, camera)
+    width, height = device.optics.size
+    slope = np.linspace(1.0, 0.9, width) * np.linspace(1.0, 0.9, height)[:, None]
+    electrons = electrons_per_radiance(device, rig.projector.wavelength_nm) * seconds
+    return np.float32(slope * level * device.sensor.saturation_e / electrons)
 
 
 @dataclass

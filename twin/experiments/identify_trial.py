@@ -25,13 +25,14 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
 from twin import board_session
 from twin.conditions import Conditions
+from twin.devices.still_scenes import even_radiance
 from twin.experiments import drawn_rig
 from twin.experiments.experiment_runs import Experiment, Settings
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
-from twin.sensor import Exposure, electrons_per_radiance, expose
+from twin.sensor import Exposure, expose
 from twin.session import CAPTURE, Session
 from twin.ultrasound.probe_path import Bob, Hand, SurfacePath
 from twin.ultrasound.timed_sweep import Clocks
@@ -171,15 +172,11 @@ def record_board(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, s
 
 def record_frames(rig: Rig, exposures: Mapping[str, Exposure], out: Path, seed: int) -> None:
     """Dark frames, and flat ones of an even light that falls by a fifth towards a corner, exposed as the surface."""
-    for number, name in enumerate(("cam1", "cam2")):
-        device = getattr(rig, name)
-        width, height = device.optics.size
-        slope = np.linspace(1.0, 0.9, width) * np.linspace(1.0, 0.9, height)[:, None]
-        exposure = exposures[name]
-        electron = electrons_per_radiance(device, rig.projector.wavelength_nm) * exposure.time_s
+    for number, name in enumerate(CAMERAS):
+        device, exposure = getattr(rig, name), exposures[name]
         for place, level in {"dark": 0.0, **{f"flat/{{}}/{k}": level for k, level in enumerate(LEVELS)}}.items():
-            radiance = np.float32(slope * level * device.sensor.saturation_e / electron)
-            stack = np.broadcast_to(radiance, (FRAMES, height, width))
+            radiance = even_radiance(rig, name, level, exposure.time_s)
+            stack = np.broadcast_to(radiance, (FRAMES, *radiance.shape))
             images = expose(stack, device, rig.projector.wavelength_nm, exposure, seed + number + round(100 * level))
             folder = out / (place.format(name) if "{}" in place else f"{place}/{name}")
             folder.mkdir(parents=True)

@@ -28,8 +28,7 @@ def laid_out(rig: Rig, layout: Layout) -> Rig:
             changed[name] = device.model_copy(update={"optics": moved(device.optics, distance, aim_mm)})
     if layout.target_scale != 1:
         changed["target"] = _scaled(rig, layout.target_scale)
-    moved_devices = [f"{name}.optics" for name in changed if name != "target"]
-    return (rig.unmeasured(*moved_devices) if moved_devices else rig).model_copy(update=changed)
+    return rig.unmeasured(*(f"{name}.optics" for name in changed)).model_copy(update=changed)
 
 
 def moved(optics: Optics, distance_mm: float, aim_mm: float = AIM_MM) -> Optics:

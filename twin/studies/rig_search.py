@@ -163,10 +163,10 @@ def search_by_prediction(
     """
     listed = all(isinstance(factor, Choices) for factor in factors.values())
     points = factorial(factors) if listed else filling(factors, DRAWN, "sobol")
-    predicted = dict(enumerate(foresee(points)))
-    figures = {name for done in predicted.values() for one in done for name in one.figures} | {PRICE}
+    predicted = foresee(points)
+    figures = {name for done in predicted for one in done for name in one.figures} | {PRICE}
     known = goal.model_copy(update={"bounds": {name: bound for name, bound in goal.bounds.items() if name in figures}})
-    judgements = [judged(known, factors, point, predicted[number]) for number, point in enumerate(points)]
+    judgements = [judged(known, factors, point, done) for point, done in zip(points, predicted, strict=True)]
     likely = sorted((one for one in judgements if one.excess <= CLOSE and math.isfinite(one.value)), key=lambda one: one.value)
     if not (likely or goal.start):
         raise InputError("search: bounds: expected some that a candidate is predicted to keep, found none that does")
