@@ -13,6 +13,7 @@ from scenes.catalogue import parse_scene
 from sonotwin import config
 from sonotwin.cli import VERBS
 from sonotwin.config import compose, folder
+from twin.experiments import identify_trial
 from twin.experiments.experiment_runs import Settings
 from twin.optics.light_transport import Tracing
 from twin.ultrasound.sweep_session import AnyPath
@@ -104,3 +105,41 @@ def test_a_choices_fields_are_its_models_defaults(group, name, parse):
     """Of each kind of scene and path, and of the usual choice of the other groups."""
     content = yaml.safe_load((folder() / group / f"{name}.yaml").read_text(encoding="utf-8"))
     assert differences(parse(content), name) == []
+
+
+TARGETS = "filament_depths_mm row_x_mm cysts bright dark"  # of a test object
+OF_PATIENTS = (
+    "aperture_mm aperture_rays bandwidth dynamic_range_db face_ring_db face_ring_mm gain_db noise_db picture receive_f_number "
+    "scatterers_per_mm3 tgc_db_per_cm_mhz transmit_f_number transmit_focus_mm"
+)
+OF_CURVED_ARRAYS = (
+    "aperture_mm bandwidth elevation_focus_mm elevation_mm face_ring_mm frequency_mhz image_size noise_db receive_f_number "
+    "reverberations scale_mm_per_px scatterers_per_mm3 tgc_limit_db transmit_f_number transmit_focus_mm"
+)
+OTHERS = {
+    ("scene", "gelatin"): f"size_mm {TARGETS}",
+    ("ultrasound", "water"): "gain_db tgc_db_per_cm_mhz",
+    ("ultrasound", "bright"): OF_PATIENTS,
+    ("ultrasound", "clinic"): f"{OF_PATIENTS} tgc_limit_db",
+    ("ultrasound", "curved"): OF_CURVED_ARRAYS,
+}
+
+
+@pytest.mark.parametrize(("group", "name"), OTHERS, ids="=".join)
+def test_another_choice_differs_from_the_defaults_only_where_it_is_to(group, name):
+    """What it repeats of the model's defaults follows them."""
+    content = yaml.safe_load((folder() / group / f"{name}.yaml").read_text(encoding="utf-8"))
+    made = Transducer.model_validate(content) if group == "ultrasound" else parse_scene(content)[1]
+    found = {line.partition(":")[0].removeprefix(f"{name}.") for line in differences(made, name)}
+    assert found == set(OTHERS[group, name].split())
+
+
+def test_all_scanners_are_held_against_the_defaults():
+    there = {path.stem for path in (folder() / "ultrasound").glob("*.yaml")}
+    assert there == {"linear"} | {name for group, name in OTHERS if group == "ultrasound"}
+
+
+def test_the_phantom_of_the_trials_is_that_of_conf():
+    """Of `study name=identify`, by which a laboratory tries the same with `scene=gelatin`."""
+    gelatin = yaml.safe_load((folder() / "scene" / "gelatin.yaml").read_text(encoding="utf-8"))
+    assert parse_scene(identify_trial.PHANTOM) == parse_scene(gelatin)
