@@ -71,7 +71,7 @@ class _Light(NamedTuple):
 def record_frames(recording: Recording, stage: Stage, operator: Operator, plan: FramesPlan, say: Say, show: Show) -> bool:
     """Record when the operator is ready, in place of earlier ones; returns whether they were kept.
 
-    Frames with faults are kept only if the operator then keeps them, or ends, rather than takes them again.
+    Frames with faults are kept only if the operator then keeps them; whoever ends has none, as identification reads all.
     """
     operator.ask(Step(WORDS[plan.kind]))
     taken: dict[str, Images] = {}
@@ -80,16 +80,16 @@ def record_frames(recording: Recording, stage: Stage, operator: Operator, plan: 
         answer = operator.answer()
         if answer in PENDING:
             continue
-        if answer in ("end", "keep") and taken:
-            break
         if answer == "end":
             return False
+        if answer == "keep" and taken:
+            break
         taken, faults = _flat(stage, plan, show) if plan.kind == "flat" else _still(stage, plan, show)
         for place, images in taken.items():
             say(f"{place} {images.mean():.1f} DN in the mean of {len(images)} images")
         if not faults or answer == "keep":
             break
-        operator.ask(Step(f"{sentence(faults)}; take it again, or end to keep it as it is"))
+        operator.ask(Step(f"{sentence(faults)}; take it again, or k keeps it as it is"))
     recording.add_frames(plan.kind, taken)
     return True
 

@@ -124,9 +124,9 @@ class _BoardHand:
 
 
 class OneTake:
-    """Takes once, and keeps what came of it; of a sweep, ends when its path is over."""
+    """Takes once, and keeps what came of it, whatever is wrong with it; of a sweep, ends when its path is over."""
 
-    def __init__(self, over: Callable[[], bool] = lambda: True) -> None:
+    def __init__(self, over: Callable[[], bool] | None = None) -> None:
         self._over, self._asked = over, 0
 
     def ask(self, step: Step) -> None:
@@ -134,9 +134,11 @@ class OneTake:
         self._asked += 1
 
     def answer(self) -> Answer:
-        """`take` at first, then `end` as soon as it is over."""
+        """`take` at first, then `keep`, or `end` of a sweep as soon as it is over."""
         if self._asked < 2:
             return "take"
+        if self._over is None:
+            return "keep"
         return "end" if self._over() else "wait"
 
 

@@ -73,10 +73,11 @@ def test_flat_frames_have_two_levels_of_one_light(rig, tmp_path):
     ],
 )
 def test_frames_that_are_not_so_are_told_and_kept_only_if_wanted(rig, tmp_path, kind, level, light, told):
-    kept, asked, _, frames = record(tmp_path / "kept", rig, kind, level, ["take", "end"], light)
-    assert told in asked[1] and "take it again" in asked[1] and kept and frames
-    kept, _, _, frames = record(tmp_path / "ended", rig, kind, level, ["wait", "end"], light)
-    assert not kept and not frames
+    kept, asked, _, frames = record(tmp_path / "kept", rig, kind, level, ["take", "keep"], light)
+    assert told in asked[1] and "take it again, or k keeps it" in asked[1] and kept and frames
+    for answers in (["take", "end"], ["wait", "end"]):  # such as of a terminal that is closed
+        kept, _, _, frames = record(tmp_path / "ended", rig, kind, level, answers, light)
+        assert not kept and not frames
 
 
 def test_better_frames_take_the_place_of_those_before(rig, tmp_path):
