@@ -257,7 +257,12 @@ def _with_probe(rig: Rig, settings: Fields, base: Mapping[str, Any], calibration
         matrix = calibration.target_from_image @ rigid.transform(np.eye(3), (*(corner * calibration.scale), 0.0))
         turn = np.rad2deg(Rotation.from_matrix(matrix[:3, :3]).as_rotvec())
         target_from_image = Pose(rotation_deg=tuple(turn.tolist()), translation_mm=tuple(matrix[:3, 3].tolist()))
-    probe = Probe(image_size=size, scale_mm_per_px=scale, target_from_image=target_from_image)
+    return with_image(rig, size, scale, target_from_image)
+
+
+def with_image(rig: Rig, size: tuple[int, int], scale_mm_per_px: tuple[float, float], target_from_image: Pose) -> Rig:
+    """The rig whose probe gives images of a size, at a place."""
+    probe = Probe(image_size=size, scale_mm_per_px=scale_mm_per_px, target_from_image=target_from_image)
     return rig.model_copy(update={"probe": probe})
 
 

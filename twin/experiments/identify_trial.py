@@ -18,8 +18,8 @@ from recon.capture.manifest import SCANNER, sweep_part
 from recon.files.metrics import Metrics
 from recon.identification.estimates import Findings
 from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
-from recon.model.rig import Probe, Rig
-from recon.session import rig_step
+from recon.model.rig import Rig
+from recon.session import rig_step, scanner_step
 from scenes.acoustics import TISSUES
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
@@ -101,9 +101,7 @@ def identify_recorded(
 
 def with_scanner(rig: Rig, array: Transducer) -> Rig:
     """The rig with images of a scanner."""
-    held = rig.probe.target_from_image
-    probe = Probe(image_size=array.image_size, scale_mm_per_px=array.scale_mm_per_px, target_from_image=held)
-    return rig.model_copy(update={"probe": probe})
+    return scanner_step.with_image(rig, array.image_size, array.scale_mm_per_px, rig.probe.target_from_image)
 
 
 def record_sweeps(rig: Rig, array: Transducer, out: Path, seed: int) -> None:
