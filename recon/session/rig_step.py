@@ -7,12 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
@@ -20,7 +19,7 @@ from recon.capture.board_part import BoardCapture
 from recon.capture.images import image_files, read_images
 from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest
 from recon.capture.surface_part import SurfaceCapture
-from recon.errors import InputError
+from recon.errors import InputError, one_line
 from recon.files import atomic, yaml_text
 from recon.identification import calibrated_optics, lenses, projector, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
@@ -28,9 +27,9 @@ from recon.identification.projector import CameraBlur
 from recon.identification.sensors import DarkStack, FringeStack, ImageSettings
 from recon.model.boards import Discs
 from recon.model.calibration import Calibration
-from recon.model.part import Positive
+from recon.model.part import Part, Positive
 from recon.model.patterns import Fringes
-from recon.model.rig import Rig
+from recon.model.rig import Measured, Rig
 from recon.optical_calibration.joint_calibration import Result
 from recon.registry import Choice
 from recon.session import hand_step, optics_step, scanner_step
@@ -42,6 +41,7 @@ from recon.structured_light.triangulate import triangulate
 
 BY = "identify"  # who writes
 RIG, CONDITIONS, FIGURES = "rig.yaml", "conditions.yaml", "identified.json"
+GROUP = "conditions."
 CAMERAS = ("cam1", "cam2")
 BLUR_SIGMA_PX = 0.15, 0.5  # of a camera's point spread where no board showed it, and with its defocus where none showed this
 BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
@@ -76,6 +76,8 @@ class Settings(scanner_step.Fields):
     """a capture folder with a board, a surface under fringes, or both; or with films, or sweeps by the scanner, or all of that"""
     rig: Annotated[Rig, Choice("meza2021")]
     """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
+    conditions: Part | None = None
+    """those to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     day: date | None = None
     """of the capture, such as 2026-11-30; null: that of its manifest.json, in UTC"""
     calibration: Path | None = None
@@ -99,23 +101,35 @@ class Settings(scanner_step.Fields):
     """files that calibrate-probe wrote before and after a session, and so on of further ones: the bracket's giving"""
 
 
+class Identification(NamedTuple):
+    """The rig with what was measured in it, all that the captures show, and the scanner; and what the capture holds."""
+
+    rig: Rig
+    findings: Findings
+    scanner: Found | None
+    manifest: Manifest
+
+
 def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     """Identify, and write the rig's file, that of its conditions, and all figures.
 
     Raises
     ------
     InputError
-        If the capture is incomplete or damaged, holds neither a board, fringes nor films or sweeps that are named, or `out` can't
-        be written to.
+        If the capture is incomplete or damaged, holds neither a board, fringes nor films or sweeps that are named, the conditions
+        to begin with are missing, or `out` can't be written to.
     """
     scans = (Path(name) for name in (settings.tissue, settings.air, settings.steps) if name)
     inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes, *scans)
     atomic.check_folder(out, BY, inputs=inputs)
     _check_version(settings.rig, out / RIG)
-    rig, found, scanned = identify(settings, watch)
+    rig, found, scanned, manifest = identify(settings, watch)
+    conditions = _conditions(settings.conditions, found)
+    if settings.rig.measured and settings.conditions == type(conditions)():
+        watch.say("conditions  begin from ideal ones; conditions=FILE keeps those of an earlier identification, as rig=FILE does")
     for line in describe(found):
         watch.say(line)
-    name = read_manifest(settings.capture).name_of(settings.capture)
+    name = manifest.name_of(settings.capture)
     if any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
         rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
@@ -126,7 +140,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     )
     with atomic.new_folder(out, BY) as new:
         rig_file.write(new / RIG, rig, found.unknown, heading)
-        (new / CONDITIONS).write_text(conditions_text(found), encoding="utf-8")
+        _write_conditions(new / CONDITIONS, conditions, found, name)
         content = json.dumps(asdict(found), indent=2, ensure_ascii=False, allow_nan=False)
         (new / FIGURES).write_text(content + "\n", encoding="utf-8")
         if scanned is not None:
@@ -147,8 +161,8 @@ def _day(path: Path) -> date:
 
 
 @linear_algebra.on_one_thread()
-def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings, Found | None]:
-    """The rig with what was measured in it, all that the captures show, and the scanner; raises InputError as `run` does."""
+def identify(settings: Settings, watch: Watch = SILENT) -> Identification:
+    """Identify from the captures alone; raises InputError as `run` does."""
     manifest, settings = read_manifest(settings.capture), _with_own_frames(settings)
     seen = manifest.board is not None or manifest.surface is not None
     for name in ("dark", "flat", "room", "gain", "adc_bits"):
@@ -167,7 +181,7 @@ def identify(settings: Settings, watch: Watch = SILENT) -> tuple[Rig, Findings, 
         rig, found = _optical(settings, manifest, rig, found, watch)
     elif by_films:
         found |= _films(settings, rig, None, watch)
-    return rig_file.apply(rig, found), found, scanned
+    return Identification(rig_file.apply(rig, found), found, scanned, manifest)
 
 
 def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, watch: Watch) -> tuple[Rig, Findings]:
@@ -390,17 +404,32 @@ def _images(folder: Path, device: Device) -> Images:
     return read_images(paths, device.size, device.bits)
 
 
-def conditions_text(found: Findings) -> str:
-    """A file for `conditions=FILE`: as measured, all else ideal."""
-    content: dict[str, Any] = {}
-    lines = ["# conditions as identified, with their standard deviations; all else is ideal"]
+def _conditions(before: Part | None, found: Findings) -> Part:
+    """Conditions with what was measured of them; InputError if they can't be."""
+    if before is None:
+        raise InputError("conditions: expected those to begin with, found none")
+    content = before.model_dump(mode="json")
     for name, one in found.estimates.items():
-        group, _, rest = name.partition(".")
-        if group == "conditions":
-            part, field = rest.split(".")
-            content.setdefault(part, {})[field] = float(f"{one.value:.4g}")
-            lines.append(f"# {rest}: ± {one.sigma:.2g}, {one.source}")
-    return "\n".join(lines) + "\n" + yaml.safe_dump({"defaults": ["ideal"], **content}, sort_keys=False)
+        if name.startswith(GROUP):
+            rig_file.put(content, name.removeprefix(GROUP), one.value)
+    try:
+        return type(before).model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"conditions: as measured, they can't be: {one_line(error)}") from error
+
+
+def _write_conditions(path: Path, conditions: Part, found: Findings, name: str) -> None:
+    """Write conditions for `conditions=FILE`, a line a value, with what is known of it; name: of the capture."""
+    own = {one.removeprefix(GROUP): each for one, each in found.estimates.items() if one.startswith(GROUP)}
+    measured = {one: Measured(sigma=each.sigma, source=each.source) for one, each in own.items()}
+    unknown = {one.removeprefix(GROUP): why for one, why in found.unknown.items()}
+    heading = "\n".join(
+        (
+            f"Conditions as identified from {name}: numbers with an uncertainty (1 sigma) were measured there, others are",
+            "as in the conditions that it began with. `sonotwin VERB conditions=FILE` takes them.",
+        )
+    )
+    rig_file.write_fields(path, conditions.model_dump(mode="json"), measured, unknown, heading)
 
 
 def describe(found: Findings) -> Iterator[str]:

@@ -5,7 +5,8 @@ lenses (`dark`), of an even light (`flat`) and of the scene with the projector c
 `still` and `hand`, show the tracker's noise and drop-outs, a hand's tremor and the jitter of triggers; calibrations of the probe
 before and after a session (`probes`) show how far its bracket gives. Writes into the folder `out`:
 rig.yaml, for `rig=FILE` of any verb, which says of each number how well it is known or why it isn't; conditions.yaml, for
-`conditions=FILE`; and identified.json. What is there already is replaced. Takes some ten seconds for a surface, for a
+`conditions=FILE`; and identified.json. Given to `identify` again, both files keep what was measured before and isn't now. What
+is there already is replaced. Takes some ten seconds for a surface, for a
 board as `sonotwin calibrate-optics` does, and for films as `sonotwin track`.
 
 With B-scans of even tissue (`tissue`), of the probe in air (`air`) and from a probe on a slide (`steps`) it also measures the
@@ -25,12 +26,15 @@ from typing import Annotated
 from recon.registry import Choice
 from recon.session import rig_step
 from sonotwin.console_watch import ConsoleWatch
+from twin.conditions import Conditions
 from twin.ultrasound.transducer import Transducer
 
 
 class Config(rig_step.Settings):
     """Fields of `sonotwin identify`."""
 
+    conditions: Annotated[Conditions, Choice("ideal")]
+    """those to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     ultrasound: Annotated[Transducer, Choice("linear")]
     """the scanner's description to begin with, of a linear array: what isn't measured stays as it has it"""
     out: Path

@@ -1,6 +1,7 @@
 """`sonotwin identify`, from captures to a rig's file that other verbs take."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsy
     text = (tmp_path / "ours" / "rig.yaml").read_text()
     assert text.startswith("# A rig as last identified from capture") and "# not measured: " in text
     conditions = (tmp_path / "ours" / "conditions.yaml").read_text()
-    assert "defaults:\n- ideal\n" in conditions and "flicker" in conditions
+    assert re.search(r"\n  flicker: [0-9.]+  # ± [0-9.e-]+: ", conditions) and "tremor_mm: 0.0  # not measured: " in conditions
 
 
 def test_without_frames_what_they_show_is_unknown_and_files_of_others_stay(capture, tmp_path, capsys):
