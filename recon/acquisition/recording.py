@@ -13,7 +13,7 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from datetime import datetime
+from datetime import UTC, date, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -191,9 +191,10 @@ class Recording:
             raise InputError(f"{folder}: expected nothing where a sweep is recorded, {found}")
 
     def _enter(self, name: PartName, part: manifest.Part, devices: Mapping[str, Device]) -> None:
-        """Enter a part into the manifest; InputError if its devices are others than those of the capture's other parts."""
+        """Enter a part of today into the manifest; InputError if its devices are others than those of other parts."""
+        today = part.model_copy(update={"day": _today()})
         try:
-            self._exchange(writer.with_part(self._manifest, name, part, devices))
+            self._exchange(writer.with_part(self._manifest, name, today, devices))
         except ValidationError as error:
             raise InputError(
                 f"{self.folder / manifest.MANIFEST}: {one_line(error)}; another rig? give another out=FOLDER"
@@ -348,6 +349,10 @@ def _check_capture(folder: Path) -> None:
         expected = f"expected a new folder or a capture folder, which has {manifest.MANIFEST}"
         way = f"is {within} meant?" if (within / manifest.MANIFEST).is_file() else "give another out=FOLDER"
         raise InputError(f"{folder}: {expected}, found other files; {way}")
+
+
+def _today() -> date:
+    return datetime.now(UTC).date()
 
 
 def _write_whole(path: Path, data: bytes | np.ndarray) -> None:

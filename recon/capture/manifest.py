@@ -7,6 +7,7 @@ Everything is checked on load; a fault is an `InputError` of one line that names
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from datetime import date
 from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Literal, NamedTuple
@@ -66,6 +67,7 @@ class Device(rig.Part):
 class Part(rig.Part):
     """A part of a capture."""
 
+    day: date | None = None  # in UTC, of its newest images; none of what wasn't recorded by `record`, such as renders
     devices: dict[Name, Device] | None = None  # those that were set otherwise for this part than the capture's; of the same sizes
 
 
@@ -185,6 +187,11 @@ class Manifest(rig.Part):
     def name_of(self, folder: Path) -> str:
         """The capture's name: its own, or that of its folder."""
         return self.name or folder.resolve().name
+
+    @property
+    def newest_day(self) -> date | None:
+        """On which the newest part was recorded; None if no part says."""
+        return max((day for name in self.contents if (day := self.part(name).day) is not None), default=None)
 
     @model_validator(mode="after")
     def _one_or_named(self) -> "Manifest":

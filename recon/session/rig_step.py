@@ -79,7 +79,7 @@ class Settings(scanner_step.Fields):
     conditions: Part | None = None
     """those to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     day: date | None = None
-    """of the capture, such as 2026-11-30; null: that of its manifest.json, in UTC"""
+    """of the capture, such as 2026-11-30; null: that on which its newest part was recorded, else that of manifest.json, in UTC"""
     calibration: Path | None = None
     """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
     dark: Path | None = None
@@ -131,7 +131,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         watch.say(line)
     name = manifest.name_of(settings.capture)
     if any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
-        rig = rig_file.next_version(rig, name, settings.day or _day(settings.capture / MANIFEST))
+        rig = rig_file.next_version(rig, name, settings.day or manifest.newest_day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
         (
             f"A rig as last identified from {name}: numbers with an uncertainty (1 sigma) were measured, there or before,",

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import date
 
 import numpy as np
 import pytest
@@ -27,6 +28,9 @@ PARTS = tuple(
     for part in (Fringes(axis=axis, pitch=8, steps=3), GrayCode(axis=axis, pitch=8, bits=bits))
 )
 PATTERNS = Patterns(projector_size=(64, 48), unwrap="gray", parts=PARTS)
+
+THREE = Patterns(projector_size=(64, 48), unwrap="gray", parts=(Fringes(pitch=8, steps=3), GrayCode(pitch=8, bits=3)))
+DEVICES = {"cam1": CAMERA, "projector": PROJECTOR}
 
 
 def image(rng) -> np.ndarray:
@@ -59,6 +63,20 @@ def test_a_capture_grows_over_several_recordings(tmp_path, rng):
     assert set(read.contents) == {"surface", "board", "sweep/s0", "sweep/s1"} and len(read_board(out).poses) == 2
     assert [entry.name for entry in (out / "surface").iterdir()] == ["take02"]
     assert read.surface.images["cam1"][0].startswith("surface/take02/")
+
+
+def test_each_part_has_the_day_of_its_newest_images(tmp_path, rng, monkeypatch):
+    """A surface of one day, and a board of the next."""
+    out = tmp_path / "out"
+    with recording.open_recording(out) as capture:
+        for day, record in (
+            (date(2026, 3, 1), lambda: capture.add_surface({"cam1": np.stack([image(rng)] * THREE.count)}, THREE, DEVICES)),
+            (date(2026, 3, 2), lambda: capture.add_pose({"cam1": image(rng)}, {}, BOARD, None, DEVICES)),
+        ):
+            monkeypatch.setattr(recording, "_today", lambda day=day: day)
+            record()
+    read = read_manifest(out)
+    assert (str(read.surface.day), str(read.board.day), str(read.newest_day)) == ("2026-03-01", "2026-03-02", "2026-03-02")
 
 
 def test_what_would_be_lost_or_mixed_is_refused(tmp_path, rng):

@@ -1,12 +1,15 @@
 """One identification after another, of unlike captures: what was measured before stays, with its sigmas and sources."""
 
 import json
+import os
+import shutil
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from recon.capture.manifest import CAMERAS, SCANNER, Device
+from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Device, read_manifest, write_manifest
 from recon.capture.writer import new_capture
 from recon.identification.estimates import Estimate, Findings
 from recon.model.calibration import Calibration, Uncertainty
@@ -146,3 +149,14 @@ def test_conditions_that_cannot_be_are_refused(surface, made, tmp_path, capsys, 
     assert main(["identify", f"capture={surface}", f"out={tmp_path / 'ours'}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "conditions: as measured, they can't be: frames.flicker" in line and not (tmp_path / "ours").exists()
+
+
+def test_the_day_is_that_on_which_the_newest_part_was_recorded(surface, made, tmp_path):
+    """However late the folder is copied; and that of the manifest's file where no part says."""
+    copied = shutil.copytree(surface, tmp_path / "copied")
+    os.utime(copied / MANIFEST, (0, 0))
+    assert str(read_rig(identify(copied, tmp_path / "ours") / "rig.yaml").identified.day) == "1970-01-01"
+    held = read_manifest(copied)
+    older = held.surface.model_copy(update={"day": date(2026, 3, 2)})
+    write_manifest(copied, held.model_copy(update={"surface": older}))
+    assert str(read_rig(identify(copied, tmp_path / "ours") / "rig.yaml").identified.day) == "2026-03-02"
