@@ -6,7 +6,6 @@ What shows what; all lengths across the depth are in wavelengths:
   where the beam's waist lies in the tissue; `gain_db` plus the tissue's echo; `tgc_db_per_cm_mhz` less its attenuation
 - the probe in air: `face_ring_mm` and `face_ring_db`, and with tissue `noise_db`, unless noise is under the last grey
 - even tissue at steps across the plane: `elevation_mm` and `elevation_focus_mm`
-- wires in water: apertures and foci once more, with greys a dB from tissue; see `wire_spread`
 - a tank's bottom: its repeats are R x `face_reflection` apart, but clip as the bottom does, and R is of the bottom
 
 All of it rests on raw speckle. Behind a scanner that compounds or smooths, or whose grey map is bent, numbers would be off by up

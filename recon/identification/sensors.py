@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from recon.identification.dark_frames import Interval, dark_moments, fit_dark
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.photon_transfer import (
-    ROUNDING,
     PhotonTransfer,
     TileNoise,
     noise_of_flat,
@@ -128,18 +127,6 @@ def identify_sensor(
     else:
         found |= _without_dark(n, settings, line, seen, flats)
     return found
-
-
-def noise_variance(
-    level: Array, *, saturation_e: float, dark_noise_e: float, black_level_dn: float, settings: ImageSettings
-) -> Array:
-    """Temporal variance of one frame, DN^2, that a sensor shows at mean levels of the image, DN, short of clipping.
-
-    Rounding counts as 1/12, which holds for noise from about 0.5 DN on.
-    """
-    gain = _range(settings, black_level_dn) / saturation_e
-    signal = np.asarray(level, float) + 0.5 - settings.step[0] - black_level_dn * 2.0 ** (settings.bits - 8)
-    return gain * signal + (gain * dark_noise_e) ** 2 + ROUNDING
 
 
 def _range(settings: ImageSettings, black_level_dn: float) -> float:

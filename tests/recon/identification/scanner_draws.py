@@ -1,19 +1,15 @@
-"""Scanners drawn at random, and what the twin's scanner shows of even tissue, of air and of wires."""
-
-from dataclasses import replace
+"""Scanners drawn at random, and what the twin's scanner shows of even tissue and of air."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.scanner import Recordings, Sheet
-from recon.identification.wire_spread import Sightings
-from scenes.acoustics import TISSUES
 from scenes.tissue import Tissue
 from tests.twin.ultrasound.phantoms import down
 from twin.experiments.drawn_rig import draw_scanner
 from twin.ultrasound.bscan import scan
-from twin.ultrasound.echo_solids import Body, Wire
+from twin.ultrasound.echo_solids import Body
 from twin.ultrasound.transducer import Transducer
 
 Images = NDArray[np.uint8]
@@ -55,22 +51,6 @@ def sheet_of(array: Transducer, attenuation: float, rng: np.random.Generator) ->
         Estimate(a, SHEET[0] * a, "sheet"),
         Estimate(SHEET[1] * rng.standard_normal(), SHEET[1], "sheet"),
     )
-
-
-def wires_seen(array: Transducer, rng: np.random.Generator, count: int = 16) -> tuple[Images, Sightings]:
-    """B-scans of a steel wire each, every second one square to the plane, the others aslant by 35 to 60 degrees."""
-    images, pixels, directions = [], [], []
-    (sx, sy), steel = array.scale_mm_per_px, replace(TISSUES["steel"], roughness=0.0)
-    for k in range(count):
-        depth = float(rng.uniform(7, array.depth_mm - 3))
-        slant = 0 if k % 2 else np.deg2rad(rng.uniform(35, 60) * rng.choice([-1, 1]))
-        direction = np.array([np.sin(slant), 0.0, np.cos(slant)])
-        along = 20 * np.array([direction[0], -direction[2], 0.0])
-        wire = Wire("wire", steel, np.array([0, 0, depth]) + np.stack([-along, along]), 0.03)
-        images.append(scan(Body(EMPTY, (), (wire,)), array, down(array, (0, 0, 0)), 1, k).image)
-        pixels.append((array.width_mm / 2 / sx, depth / sy))
-        directions.append(direction)
-    return np.stack(images), Sightings(np.arange(count), np.array(pixels), np.array(directions))
 
 
 def deviations(found: Findings, array: Transducer) -> dict[str, float]:

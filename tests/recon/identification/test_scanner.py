@@ -5,8 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from recon.freehand import sequences
-from recon.identification import displayed_speckle, scanner, wire_spread
-from recon.identification.estimates import Estimate
+from recon.identification import displayed_speckle, scanner
 from tests.recon.identification import scanner_draws
 from twin.ultrasound.transducer import Transducer
 
@@ -61,20 +60,6 @@ def test_dead_elements_are_columns_dark_in_all_images(usual, rng):
     images[..., [20, 61]] -= 12
     found = scanner.dark_columns(images.clip(0, 255).astype(np.uint8))
     assert set(found) == {20, 61} and all(abs(below.value - 12) < 8 for below in found.values())
-
-
-@pytest.mark.slow
-def test_wires_show_apertures_and_the_slice():
-    """Within 3.5 standard deviations, by a grey map that is right."""
-    quiet = {"gain_db": -52.0, "reverberations": 0, "noise_db": -90.0, "tgc_db_per_cm_mhz": 0.0}
-    array = Transducer(image_size=(128, 620), scale_mm_per_px=(0.1229, 0.06), **quiet)
-    rng = np.random.default_rng(5)
-    images, seen = scanner_draws.wires_seen(array, rng)
-    greys = Estimate(255 / array.dynamic_range_db, 0.01 * 255 / array.dynamic_range_db, "speckle")
-    found = wire_spread.wires(images, seen, scanner_draws.sheet_of(array, 0.5, rng), greys)
-    off = scanner_draws.deviations(found, array)
-    assert off.keys() >= {"receive_f_number", "transmit_f_number", "elevation_mm", "elevation_focus_mm"}
-    assert max(map(abs, off.values())) < 3.5
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from scipy import stats
 
 from recon.identification.dark_frames import dark_moments, expected_moments, fit_dark
 from recon.identification.photon_transfer import PhotonTransfer, TileNoise, noise_of_fringes, transfer_line
-from recon.identification.sensors import DarkStack, FringeStack, ImageSettings, identify_sensor, noise_variance
+from recon.identification.sensors import DarkStack, FringeStack, ImageSettings, identify_sensor
 from recon.model.rig import Sensor
 from twin.sensor import Exposure, Numbers, fixed_pattern, noise_dn, readout_by, sensed
 
@@ -157,16 +157,6 @@ def test_dark_frames_alone(shots):
     estimate = found.estimates["cam1.sensor.black_level_dn"]
     assert abs(estimate.value - shots.sensor.black_level_dn) < 2 * estimate.sigma  # nearly all by dark current, which isn't seen
     assert "DN; electrons need a gain" in found.unknown["cam1.sensor.dark_noise_e"]
-
-
-def test_predicted_variance_is_the_twins(rig):
-    """The variance over the grey level, against the twin's formula over its electrons."""
-    sensor, settings = rig.cam1.sensor, ImageSettings(10, 1.0, 10)
-    electrons = np.linspace(0, 7000, 8)
-    level = 4 * sensor.black_level_dn + electrons * (1024 - 4 * sensor.black_level_dn) / sensor.saturation_e
-    names = ("saturation_e", "dark_noise_e", "black_level_dn")
-    found = noise_variance(level, **{name: getattr(sensor, name) for name in names}, settings=settings)
-    np.testing.assert_allclose(found, noise_dn(electrons, sensor, Exposure(0.01, 1.0, 10)) ** 2, rtol=1e-9)
 
 
 def scores(seeds: range) -> dict[str, list[float]]:
