@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import json
 import re
 import shutil
@@ -191,7 +192,24 @@ def small_projector() -> Camera:
     return Camera((256, 160), np.array([[560.0, 0, 127], [0, 560, 80], [0, 0, 1]]), np.zeros(5), pose)
 
 
-def under_patterns_alone(folder, count: int, shown: Patterns, described: Patterns, gamma: float = 1.0) -> None:
+class Erring:
+    """A sequence whose grey fringes are shifted by errors of a share of a step, drawn anew with each showing."""
+
+    def __init__(self, patterns: Patterns, share: float) -> None:
+        self._patterns, self._share, self._rng = patterns, share, np.random.default_rng(4)
+
+    def images(self):
+        """As `Patterns.images`."""
+        images = iter(self._patterns.images())
+        for part in self._patterns.parts:
+            for image in itertools.islice(images, part.count):
+                off = self._share * part.pitch / part.steps * self._rng.standard_normal() if isinstance(part, Fringes) else 0.0
+                moved = np.float32([[1, 0, off], [0, 1, 0]] if part.axis == "columns" else [[1, 0, 0], [0, 1, off]])
+                size = image.shape[::-1]
+                yield cv2.warpAffine(np.float32(image), moved, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def under_patterns_alone(folder, count: int, shown: Patterns | Erring, described: Patterns, gamma: float = 1.0) -> None:
     """A board in some poses under the small projector's patterns, seen by camera 1 of a gamma, and described as under others."""
     camera, projector, rng = cameras()["cam1"], small_projector(), np.random.default_rng(0)
     board = Chessboard(columns=6, rows=5, square_mm=24)
@@ -234,6 +252,18 @@ def test_three_steps_through_a_cameras_gamma_are_straightened_and_said(tmp_path,
     )
     found = calibration_files.read(tmp_path / "out" / "optics.yaml")
     assert abs(found.cameras["projector"].matrix[0, 0] - 560) < 4 * found.uncertainty.sigma("projector.fx") < 20
+
+
+@pytest.mark.slow
+def test_grey_fringes_whose_shifts_err_are_warned_of(tmp_path, capsys):
+    """By a tenth of a step, which moves all points of a pose alike, so that residuals hardly show it."""
+    projector = small_projector()
+    parts = [p for a in ("columns", "rows") for p in (Fringes(axis=a, pitch=16, steps=4), GrayCode(axis=a, pitch=16, bits=4))]
+    patterns = Patterns(projector_size=projector.size, unwrap="gray", parts=tuple(parts))
+    under_patterns_alone(tmp_path / "capture", 7, Erring(patterns, 0.1), patterns)
+    assert main(["calibrate-optics", f"capture={tmp_path / 'capture'}", f"out={tmp_path / 'out'}", "distortion=radial1"]) == 0
+    (told,) = [line for line in capsys.readouterr().out.splitlines() if "do the steps of grey fringes err" in line]
+    assert told.startswith("warning     the projector's coordinates shift by") and "the uncertainty includes it" in told
 
 
 @pytest.mark.parametrize(
