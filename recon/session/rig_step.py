@@ -75,9 +75,9 @@ class Settings(scanner_step.Fields):
     capture: Path
     """a capture folder with a board, a surface under fringes, or both; or with films, or sweeps by the scanner, or all of that"""
     rig: Annotated[Rig, Choice("meza2021")]
-    """to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
+    """the rig to begin with: what isn't measured stays as it has it, such as the pixels' size; the new file is one version on"""
     conditions: Part | None = None
-    """those to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
+    """the conditions to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     day: date | None = None
     """of the capture, such as 2026-11-30; null: that on which its newest part was recorded, else that of manifest.json, in UTC"""
     calibration: Path | None = None

@@ -3,11 +3,11 @@
 Reads a capture folder with the calibrations in use and any of three parts, taken before a session in two minutes: a film in which
 both cameras see the target moved about, tilted to all sides; a fringe sequence of anything smooth, seen by both cameras, best
 with fringes along both axes; and ten seconds of tracked B-scans over a flat, rough bottom in water, the probe rolled, tilted and
-moved up and down. With `today=FOLDER`, that `sonotwin identify` made of today's captures, its numbers are compared with those of
-the file of an earlier one, `rig=FILE`; without a capture they alone are. Writes into the folder `out` check.html, the verdicts
-with their course over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual
-drift, are no alarm; where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit
-status 1 if something has moved or changed. Takes some seconds.
+moved up and down. Compares the rig that `sonotwin identify` made of today's captures, `today=FOLDER`, number by number with an
+earlier one, `rig=FILE`; `capture` may then be left out. Writes into the folder `out` check.html, the verdicts with their course
+over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual drift, are no alarm;
+where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit status 1 if something has
+moved or changed. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
@@ -26,8 +26,9 @@ from recon.errors import Implausible, InputError
 from recon.files import atomic
 from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
-from recon.model.rig import NotNegative, Positive, Target
+from recon.model.rig import NotNegative, Positive, Rig, Target
 from recon.probe_calibration import sound_in_water
+from recon.registry import Choice
 from recon.rig_check import bottom_equations, check_log, check_page, drift, rig_versions, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR
@@ -51,6 +52,8 @@ FAR_MM = 2.0  # of a motion, beyond which equations are far from linear
 class Config(MeasuredTargetFields):
     """Fields of `sonotwin check`."""
 
+    rig: Annotated[Rig, Choice("meza2021")]
+    """of it, the target's design: circles' distances and diameters, and their tolerance; with today, an earlier rig.yaml"""
     capture: Path | None = None
     """folder: what it holds of these is checked: a film of the target, fringes before both cameras, a bottom; null with today"""
     today: Path | None = None

@@ -2,12 +2,12 @@
 
 Reads a capture folder with a board of discs, a surface under fringes, or both; and, if given, folders of images with covered
 lenses (`dark`), of an even light (`flat`) and of the scene with the projector covered (`room`). Films of the capture, named by
-`still` and `hand`, show the tracker's noise and drop-outs, a hand's tremor and the jitter of triggers; calibrations of the probe
-before and after a session (`probes`) show how far its bracket gives. Writes into the folder `out`:
-rig.yaml, for `rig=FILE` of any verb, which says of each number how well it is known or why it isn't; conditions.yaml, for
-`conditions=FILE`; and identified.json. Given to `identify` again, both files keep what was measured before and isn't now. What
-is there already is replaced. Takes some ten seconds for a surface, for a
-board as `sonotwin calibrate-optics` does, and for films as `sonotwin track`.
+`still` and `hand`, show the tracker's noise and drop-outs, a hand's tremor and the jitter of triggers; calibrations of the
+probe before and after a session (`probes`) show how far its bracket gives. Writes into the folder `out`: rig.yaml, for
+`rig=FILE` of any verb, which says of each number how well it is known or why it isn't; conditions.yaml, for `conditions=FILE`;
+and identified.json. What is there already is replaced. Give `rig`, `conditions` and `ultrasound` of an earlier run, and another
+`out`, and the new files keep what isn't measured again. Takes some ten seconds for a surface, for a board as `sonotwin
+calibrate-optics` does, and for films as `sonotwin track`.
 
 With B-scans of even tissue (`tissue`), of the probe in air (`air`) and from a probe on a slide (`steps`) it also measures the
 scanner, in some seconds, and writes ultrasound.yaml, for `ultrasound=FILE` of any verb. They are sweeps of the capture, by their
@@ -34,7 +34,7 @@ class Config(rig_step.Settings):
     """Fields of `sonotwin identify`."""
 
     conditions: Annotated[Conditions, Choice("ideal")]
-    """those to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
+    """the conditions to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     ultrasound: Annotated[Transducer, Choice("linear")]
     """the scanner's description to begin with, of a linear array: what isn't measured stays as it has it"""
     out: Path

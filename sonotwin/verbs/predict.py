@@ -1,9 +1,10 @@
 """Predict what errors a rig will find, before anything is recorded, and what would lower that of a plane.
 
-Reads a rig, such as that of `sonotwin identify`, with patterns, a plate and settings of light and exposure; renders nothing. Says
-the RMS distance of points from their plane, with the interval that the rig's measured numbers leave, and how it changes with each
-of the rig's numbers by which it does: -1 is an error that halves when the number doubles. `changes` are other values of any
-fields, each with its price: they are tried one by one, the most error saved for the money first. Takes some seconds.
+Reads a rig, such as rig=ours/rig.yaml of `sonotwin identify`, with patterns, a plate and settings of light and exposure; renders
+nothing. Says the RMS distance of points from their plane, with the interval that the rig's measured numbers leave; by how many
+per cent it changes for one per cent of each number of the rig, where it does: -1 is an error that halves when the number doubles.
+`changes` are other values of any fields, each with its price: they are tried one by one, the most error saved for the money
+first. Takes some seconds.
 
 The noise of camera 1, the projector's raster and the errors of a calibration whose covariance the rig has are in it; flicker, and
 light that spreads in skin, aren't. With `sessions` whole ones are drawn, from the board to a mass, with the errors of

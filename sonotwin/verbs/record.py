@@ -1,13 +1,13 @@
 """Record a part of a capture from devices: the calibration board pose by pose, a surface under fringes, a freehand sweep, frames.
 
-Guides at the terminal, and shows in a browser, at the address that it prints, what each device sees: exposure, saturation,
-focus, fringes, whether the target is found, each fault and its remedy. Each next pose of the board is chosen as the one that
-adds most to those so far, and its outline is shown over camera 1's image. OUT is a capture folder, a new one or one that grows:
-poses are added to those that are there, sweeps have names, a new surface takes the place of the old one only with
-replace=true. Frames of covered lenses (dark), of an even light (flat) and of the scene without the projector (room), which
-`sonotwin identify` finds in the folder, are recorded after the surface, by whose exposure dark and room are. Later verbs take OUT
-itself: capture=OUT. All that was recorded is on the disk at once and whole, whether the command is ended by Ctrl-C, by the system
-or by a lost cable; give it again to go on.
+Guides at the terminal, where Enter says that something is done, k keeps it whatever is wrong with it, and e ends; and shows in a
+browser, at the address that it prints, what each device sees: exposure, saturation, focus, fringes, whether the target is found,
+each fault and its remedy. Each next pose of the board is chosen as the one that adds most to those so far, and its outline is
+shown over camera 1's image. OUT is a capture folder, a new one or one that grows: poses are added to those that are there, sweeps
+have names, a new surface takes the place of the old one only with replace=true. Frames of covered lenses (dark), of an even light
+(flat) and of the scene without the projector (room), which `sonotwin identify` finds in the folder, are recorded after the
+surface, by whose exposure dark and room are. Later verbs take OUT itself: capture=OUT. All that was recorded is on the disk at
+once and whole, whether the command is ended by Ctrl-C, by the system or by a lost cable; give it again to go on.
 
 `devices=virtual` has the twin stand in for every device, and for the person: `scene`, `path` and the other fields at the end of
 this list say what is before them. It takes as long as rendering takes: ten seconds a sequence and pose, a second a pair of
