@@ -6,8 +6,8 @@ lenses (`dark`), of an even light (`flat`) and of the scene with the projector c
 probe before and after a session (`probes`) show how far its bracket gives. Writes into the folder `out`: rig.yaml, for
 `rig=FILE` of any verb, which says of each number how well it is known or why it isn't; conditions.yaml, for `conditions=FILE`;
 and identified.json. What is there already is replaced. Give `rig`, `conditions` and `ultrasound` of an earlier run, and another
-`out`, and the new files keep what isn't measured again. Takes some ten seconds for a surface, for a board as `sonotwin
-calibrate-optics` does, and for films as `sonotwin track`.
+`out`, and the new files keep what isn't measured again. Takes some ten seconds for a surface, and for
+a board as `sonotwin calibrate-optics` does, for films as `sonotwin track`.
 
 With B-scans of even tissue (`tissue`), of the probe in air (`air`) and from a probe on a slide (`steps`) it also measures the
 scanner, in some seconds, and writes ultrasound.yaml, for `ultrasound=FILE` of any verb. They are sweeps of the capture, by their
