@@ -157,7 +157,7 @@ def fit_dark(moments: DarkMoments, line: PhotonTransfer, step: float) -> DarkFit
     step : DN
         As of `expected_moments`; levels of the signal are `1/2 - step` above those of images.
     """
-    shift = 0.5 - step
+    cut_off = 0.5 - step
     mean, temporal, spatial = moments.values
     dark, lit = temporal + max(spatial, 0), (line.darkest + line.brightest) / 2
     start_gain = line.gain
@@ -182,9 +182,9 @@ def fit_dark(moments: DarkMoments, line: PhotonTransfer, step: float) -> DarkFit
 
     def residuals(q: Array) -> Array:
         by, black, noise, spread = signal(q)
-        off_line = whiten_line @ [by - line.gain, (by * noise) ** 2 - by * (black - shift) - line.intercept]
+        off_line = whiten_line @ [by - line.gain, (by * noise) ** 2 - by * (black - cut_off) - line.intercept]
         if not shown:  # one value: somewhere in its step
-            return np.append(off_line, (black - (moments.usual + shift)) * np.sqrt(12))
+            return np.append(off_line, (black - (moments.usual + cut_off)) * np.sqrt(12))
         return np.append(off_line, whiten @ (moments.values - expected_moments(black, by * noise, by * spread, step)))
 
     def least(start: Array, held: tuple[int, float, float] | None = None) -> tuple[float, Array, Array]:
@@ -197,7 +197,7 @@ def fit_dark(moments: DarkMoments, line: PhotonTransfer, step: float) -> DarkFit
 
     def start(noise: float, angle: float) -> Array:
         share = float(ndtri(np.clip(mean - np.floor(mean), 1e-6, 1 - 1e-6)))  # of two values
-        return np.array([0.0, share if noise < TWO else (mean + shift - edge) / noise, np.log(noise), angle])
+        return np.array([0.0, share if noise < TWO else (mean + cut_off - edge) / noise, np.log(noise), angle])
 
     noises = (np.sqrt(max(dark - 1 / 12, TWO**2)), RIDGE)
     cost, best, slopes = min((least(start(noise, angle)) for noise in noises for angle in (0.3, 1.2)), key=lambda fit: fit[0])

@@ -59,7 +59,7 @@ NEAREST, FARTHEST, STARTS = 0.4, 3.0, 25  # of the depths seen: where the focus 
 class LensLimits:
     """Which edges are used, and which results are given."""
 
-    room: float = 0.45  # of the gap between discs, and of a disc's radius, that is looked at beside an edge
+    margin: float = 0.45  # of the gap between discs, and of a disc's radius, that is looked at beside an edge
     clipped: float = 0.02  # of the pixels about an edge that may be as bright as can be
     signal: float = 8.0  # contrast over noise
     blur: float = 0.25  # of the disc's shorter radius, at most
@@ -130,17 +130,17 @@ def measure_rims(
     image = np.asarray(image, float)
     outlines = Ellipses(*ellipses_of(camera, world_from_board, centres, board.diameter_mm / 2))
     with np.errstate(invalid="ignore"):
-        extent = np.sqrt(np.einsum("nij,nij->ni", outlines.shape, outlines.shape)) * (1 + limits.room)
+        extent = np.sqrt(np.einsum("nij,nij->ni", outlines.shape, outlines.shape)) * (1 + limits.margin)
         inside = ((outlines.centre - extent > 1) & (outlines.centre + extent < np.array(camera.size) - 2)).all(axis=1)
     chosen = np.flatnonzero(inside)
     if not len(chosen):
         none = np.zeros(0)
         return Rims(none, none, none, none, none, none, none, np.zeros((0, 2)), np.zeros(0, np.int64))
     gap = 2 * max(board.pitch_mm / board.diameter_mm - 1, 0.1)  # in radii
-    room = np.maximum(limits.room * min(gap, 1.0) * outlines[chosen].semi_axes[:, 1], 2.0)
-    found = discs.measure(full - image if board.white else image, outlines[chosen], room, full)
+    margin = np.maximum(limits.margin * min(gap, 1.0) * outlines[chosen].semi_axes[:, 1], 2.0)
+    found = discs.measure(full - image if board.white else image, outlines[chosen], margin, full)
     edges, (longer, shorter) = found.edges, found.fit.ellipses.semi_axes.T
-    reach = np.minimum(room, discs.NEAR[0] + discs.NEAR[1] * edges.blur)
+    reach = np.minimum(margin, discs.NEAR[0] + discs.NEAR[1] * edges.blur)
     width, sigma = widths(found, reach)
     contrast, known = edges.outside - edges.inside, np.isfinite(edges.sigma).mean(axis=1)
     good = (contrast > limits.signal * edges.noise) & (edges.clipped <= limits.clipped) & (known > 0.95)

@@ -95,8 +95,8 @@ def noise_of_flat(frames: NDArray, bits: int) -> TileNoise:
         power += (off**2).sum(axis=1)
     freedom = (n - 1) * (TILE**2 - 1)
     variance = power / freedom
-    room = LIMITS.margin * np.sqrt(variance + spread**2)
-    usable = (level - room > 0) & (level + room < full)
+    to_ends = LIMITS.margin * np.sqrt(variance + spread**2)
+    usable = (level - to_ends > 0) & (level + to_ends < full)
     return TileNoise(level[usable], variance[usable], np.full(np.count_nonzero(usable), float(freedom)))
 
 

@@ -189,7 +189,7 @@ def _from_dark(
     fit, gain = fits[0], fits[0].gain.value
     source = f"{len(stacks[0].frames)} dark frames"
     found = Findings()
-    shift, current = 0.5 - step, None
+    cut_off, current = 0.5 - step, None
     if line and times[0] is not None and times[1] is not None and times[1] > times[0]:
         a_second = 1 / (gain * (times[1] - times[0]))
         current = max((fits[1].black.value - fits[0].black.value) * a_second, 0.0)
@@ -235,7 +235,7 @@ def _from_dark(
     if np.isfinite(fit.spread.high):
         squares = Interval(*((gain * end) ** 2 for end in fit.spread))
         pattern = squares.value, squares.sigma
-    return found | _prnu(n, settings, line, flats, (fit.black.value - shift, fit.black.sigma), pattern)
+    return found | _prnu(n, settings, line, flats, (fit.black.value - cut_off, fit.black.sigma), pattern)
 
 
 def _saturation(settings: ImageSettings, gain: tuple[float, float], black: tuple[float, float], source: str) -> Estimate:
