@@ -7,6 +7,7 @@ What a lamp changes from frame to frame is smooth, or follows the scene: it is f
 Source: EMVA 1288, Release 4.0 (variance against mean); Sheppard 1898 (variance of rounding).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,6 +37,7 @@ class TransferLimits:
     harmonics: int = 3  # of fringes, which a projector's gamma adds with some strength, and which are left out
     locked: int = 5  # harmonics of the fringes that a frame's error may show in a tile
     pairs: int = 3  # images of a code with their inverses, at least
+    sets: int = 3  # of fringes of few steps, at least
 
 
 LIMITS = TransferLimits()
@@ -107,7 +109,8 @@ def noise_of_flat(frames: NDArray, bits: int) -> TileNoise:
 def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoise | None:
     """Temporal noise of a sequence of patterns on any steady scene, of all parts that show it.
 
-    Those are fringes of eight steps or more, an even number of them if binary, and codes with the inverse of each image.
+    Those are fringes of eight steps or more, an even number of them if binary, and codes with the inverse of each image; without
+    any of these, three sets of grey fringes or more.
 
     Parameters
     ----------
@@ -129,6 +132,9 @@ def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoi
             found.append(noise_of_binary_fringes(images[place], part.shifts, bits))
         elif isinstance(part, GrayCode) and part.inverted and part.count >= 2 * LIMITS.pairs:
             found.append(noise_of_inverses(images[place], bits))
+    grey = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.waveform == "sine"]
+    if not found and len(grey) >= LIMITS.sets:
+        found.append(noise_of_offsets([images[place] for _, place in grey], [part.shifts for part, _ in grey], bits))
     return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
 
 
@@ -195,12 +201,47 @@ def noise_of_inverses(images: NDArray, bits: int) -> TileNoise:
     for _ in range(ROUNDS):  # of the scene, which errors of frames add to, and of these
         for k in range(len(sums)):
             shapes = np.stack([np.ones_like(scene), scene, scene * lit[k]], axis=1)  # (tiles, 3, pixels)
-            off = sums[k] - scene
-            inverse = np.linalg.pinv(shapes @ shapes.swapaxes(1, 2), hermitian=True)
-            left[k] = off - ((shapes @ off[..., None]).swapaxes(1, 2) @ inverse @ shapes)[:, 0]
+            left[k] = _beside(sums[k] - scene, shapes)
         scene = scene + left.mean(axis=0)
     freedom = np.full(len(scene), (len(sums) - 1.0) * (TILE**2 - 3))
     return TileNoise(scene.mean(axis=1) / 2, (left**2).sum(axis=(0, 2), dtype=float) / freedom / 2, freedom)
+
+
+def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int) -> TileNoise:
+    """Temporal noise of sets of shifted fringes of few steps on any steady scene, by their mean light, which is the same.
+
+    A gamma adds the harmonic of as many periods as there are steps; gains and shifts of frames add 1, the light and the fringe.
+
+    Parameters
+    ----------
+    sets : (n, h, w) each, DN, three or more of any pitches and axes
+    shifts : (n,) rad each
+    bits : int
+        Of the images. Tiles with a pixel that touches an end of their range are left out.
+    """
+    if len(sets) < LIMITS.sets or len(sets) != len(shifts):
+        raise ValueError(f"expected {LIMITS.sets} sets or more with their shifts, found {len(sets)} and {len(shifts)}")
+    tiles, steps = [in_tiles(images) for images in sets], np.array([len(images) for images in sets])
+    usable = np.all([(one.min(axis=(0, 2)) > 0) & (one.max(axis=(0, 2)) < 2**bits - 1) for one in tiles], axis=0)
+    offsets = [
+        np.tensordot(pseudo_inverse(turns)[0], one[:, usable].astype(float), 1) for turns, one in zip(shifts, tiles, strict=True)
+    ]
+    scene = np.average(offsets, axis=0, weights=steps)
+    power = np.zeros(len(scene))
+    for n, turns, images, offset in zip(steps, shifts, sets, offsets, strict=True):
+        around = np.stack([cv2.filter2D(image, cv2.CV_32F, AROUND / 8) for image in images])  # without the pixel's own noise
+        c, s = in_tiles(np.tensordot(pseudo_inverse(turns)[1:], around, 1))[:, usable]
+        gamma = np.hypot(c, s) * np.exp(1j * n * np.arctan2(s, c))
+        shapes = np.stack([np.ones_like(scene), scene, c, s, gamma.real, gamma.imag], axis=1)  # (tiles, 6, pixels)
+        power += n * (_beside(offset - scene, shapes) ** 2).sum(axis=1)
+    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - shapes.shape[1]))
+    return TileNoise(scene.mean(axis=1), power / freedom, freedom)
+
+
+def _beside(values: NDArray, shapes: NDArray) -> NDArray:
+    """What is left of tiles' values (t, p) by least squares with shapes (t, m, p)."""
+    inverse = np.linalg.pinv(shapes @ shapes.swapaxes(1, 2), hermitian=True)
+    return values - ((shapes @ values[..., None]).swapaxes(1, 2) @ inverse @ shapes)[:, 0]
 
 
 def _noise_beside(images: NDArray, shifts: Array, waves: Array, bits: int) -> TileNoise:

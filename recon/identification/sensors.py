@@ -108,7 +108,7 @@ def identify_sensor(
     flats : (m, h, w) each, m >= 2
         Frames of one steady, smooth light; best of two levels or more, with some hundreds of electrons at least.
     sequences : PatternStack
-        With eight steps of fringes or more, or a code and its inverse.
+        With eight steps of fringes or more, three sets of fewer, or a code and its inverses.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def identify_sensor(
         n + "dark_current_e_per_s": "needs dark frames of two exposures, and a gain",
     }
     if line is None:
-        patterns = "eight steps of fringes, or a code with its inverses"
+        patterns = "eight steps of fringes, three sets of fewer, or a code with its inverses"
         why = f"needs flat frames, or {patterns}, with a noise of 0.6 DN or more, at several levels or with dark frames"
         unknown |= dict.fromkeys((n + "saturation_e", n + "prnu"), why)
     found = Findings({}, unknown)

@@ -26,9 +26,11 @@ SHAPE = 192, 256  # px: 192 tiles
 FRAMES = 6
 EXPOSURE_S = 1 / 60
 CODE = {"kind": "gray", "pitch": 16, "bits": 4}
+UNWRAPPED = [{"projector_size": (256, 192), "unwrap": unwrap} for unwrap in ("gray", "heterodyne")]
 SEQUENCES = {
     "grey fringes": [{"kind": "fringes", "pitch": 16, "steps": 12}, CODE],
     "binary fringes": [{"kind": "fringes", "pitch": 16, "steps": 8, "origin": 7.5, "waveform": "binary"}, CODE],
+    "three steps": [{"kind": "fringes", "pitch": pitch, "steps": 3} for pitch in (16, 64, 256)],
     "inverses": [{"kind": "gray", "pitch": 4, "bits": 6, "inverted": True}],
 }
 
@@ -62,7 +64,7 @@ class Shots:
 
     def sequence(self, name: str) -> PatternStack:
         """Patterns of `SEQUENCES` by a projector with a gamma and a blur, each frame of another light; on stripes and shades."""
-        patterns = Patterns.model_validate({"projector_size": (256, 192), "unwrap": "gray", "parts": SEQUENCES[name]})
+        patterns = Patterns.model_validate(UNWRAPPED[name == "three steps"] | {"parts": SEQUENCES[name]})
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
         albedo = 0.55 + 0.35 * np.sin(x / 37 + y / 51) + 0.05 * np.sign(np.sin(y / 5))
         shown = np.concatenate([part.profiles(256) for part in patterns.parts]) ** 1.5
@@ -192,7 +194,7 @@ def test_errors_of_frames_are_no_noise(shots, name):
 
 
 def test_a_few_steps_show_no_noise(shots):
-    """Of three steps, and of a code without its inverse, nothing is left that isn't light."""
+    """Of one set of three steps, and of a code without its inverse, nothing is left that isn't light."""
     patterns = {"projector_size": (256, 192), "unwrap": "gray", "parts": [{"kind": "fringes", "pitch": 16, "steps": 3}, CODE]}
     assert noise_of_patterns(np.full((7, *SHAPE), 100, np.uint8), Patterns.model_validate(patterns), 8) is None
 
