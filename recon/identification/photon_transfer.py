@@ -234,7 +234,7 @@ def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int
         gamma = np.hypot(c, s) * np.exp(1j * n * np.arctan2(s, c))
         shapes = np.stack([np.ones_like(scene), scene, c, s, gamma.real, gamma.imag], axis=1)  # (tiles, 6, pixels)
         power += n * (_beside(offset - scene, shapes) ** 2).sum(axis=1)
-    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - shapes.shape[1]))
+    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - 6))  # less the shapes
     return TileNoise(scene.mean(axis=1), power / freedom, freedom)
 
 
