@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.model.patterns import AnyPart, Fringes, GrayCode, Patterns
 from recon.structured_light.phase import MIN_STEPS_FOR_NOISE, design, pseudo_inverse
 
 Array = NDArray[np.float64]
@@ -126,16 +126,22 @@ def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoi
     """
     found = []
     for part, place in patterns.slices():
-        if isinstance(part, Fringes) and part.steps >= MIN_STEPS_FOR_NOISE and part.waveform == "sine":
-            found.append(noise_of_fringes(images[place], part.shifts, bits))
-        elif isinstance(part, Fringes) and part.steps >= MIN_STEPS_FOR_NOISE and part.steps % 2 == 0:
-            found.append(noise_of_binary_fringes(images[place], part.shifts, bits))
-        elif isinstance(part, GrayCode) and part.inverted and part.count >= 2 * LIMITS.pairs:
+        if isinstance(part, GrayCode) and has_free_dimensions(part):
             found.append(noise_of_inverses(images[place], bits))
+        elif isinstance(part, Fringes) and has_free_dimensions(part):
+            measure = noise_of_fringes if part.waveform == "sine" else noise_of_binary_fringes
+            found.append(measure(images[place], part.shifts, bits))
     grey = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.waveform == "sine"]
     if not found and len(grey) >= LIMITS.sets:
         found.append(noise_of_offsets([images[place] for _, place in grey], [part.shifts for part, _ in grey], bits))
     return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
+
+
+def has_free_dimensions(part: AnyPart) -> bool:
+    """Whether a part's images by themselves hold noise that isn't light."""
+    if isinstance(part, GrayCode):
+        return part.inverted and part.count >= 2 * LIMITS.pairs
+    return isinstance(part, Fringes) and part.steps >= MIN_STEPS_FOR_NOISE and (part.waveform == "sine" or part.steps % 2 == 0)
 
 
 def noise_of_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
@@ -210,7 +216,8 @@ def noise_of_inverses(images: NDArray, bits: int) -> TileNoise:
 def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int) -> TileNoise:
     """Temporal noise of sets of shifted fringes of few steps on any steady scene, by their mean light, which is the same.
 
-    A gamma adds the harmonic of as many periods as there are steps; gains and shifts of frames add 1, the light and the fringe.
+    A gamma adds the harmonic of as many periods as there are steps; gains and shifts of frames add 1, the light, the fringe
+    and its second harmonic.
 
     Parameters
     ----------
@@ -231,10 +238,10 @@ def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int
     for n, turns, images, offset in zip(steps, shifts, sets, offsets, strict=True):
         around = np.stack([cv2.filter2D(image, cv2.CV_32F, AROUND / 8) for image in images])  # without the pixel's own noise
         c, s = in_tiles(np.tensordot(pseudo_inverse(turns)[1:], around, 1))[:, usable]
-        gamma = np.hypot(c, s) * np.exp(1j * n * np.arctan2(s, c))
-        shapes = np.stack([np.ones_like(scene), scene, c, s, gamma.real, gamma.imag], axis=1)  # (tiles, 6, pixels)
-        power += n * (_beside(offset - scene, shapes) ** 2).sum(axis=1)
-    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - 6))  # less the shapes
+        waves = [np.hypot(c, s) * np.exp(1j * m * np.arctan2(s, c)) for m in (1, 2, n)]
+        shapes = [np.ones_like(scene), scene, *(one for wave in waves for one in (wave.real, wave.imag))]
+        power += n * (_beside(offset - scene, np.stack(shapes, axis=1)) ** 2).sum(axis=1)
+    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - 8))  # less the shapes
     return TileNoise(scene.mean(axis=1), power / freedom, freedom)
 
 

@@ -11,7 +11,7 @@ Source: EMVA 1288, Release 4.0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from recon.identification.photon_transfer import (
     ROUNDING,
     PhotonTransfer,
     TileNoise,
+    has_free_dimensions,
     noise_of_flat,
     noise_of_patterns,
     transfer_line,
@@ -47,6 +48,7 @@ class SensorLimits:
     exposure_s: float = 1 / 30  # at most, where it isn't known
     black_level_dn: float = 16.0  # at most, 8-bit; where no dark frames measure it
     gain: float = 0.2  # relative standard deviation of K, at most
+    few_steps: float = 0.05  # relative standard deviation of K by sets of few steps: six poses of a public board scatter by 3 %
     dark: float = 0.3  # of dark noise and DSNU, at most; a DSNU is known as well where it is surely less than the noise
     dark_noise_e: float = 40.0  # at most; where no dark frames measure it
     one_value: float = 0.3  # DN, scatter of dark frames that show one value: the black level lies anywhere within its step
@@ -186,7 +188,10 @@ def _line(
     if not tiles:
         return None, ""
     gain = " at gain 1, as the camera's isn't known" if settings.gain is None else ""
-    return transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))), names + gain
+    line = transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True))))
+    if line is not None and not flats and not any(has_free_dimensions(part) for one in sequences for part in one.patterns.parts):
+        line = replace(line, covariance=line.covariance + np.diag([(LIMITS.few_steps * line.gain) ** 2, 0.0]))
+    return line, names + gain
 
 
 def _without_dark(n: str, settings: ImageSettings, line: PhotonTransfer | None, seen: str, flats: Sequence[NDArray]) -> Findings:
