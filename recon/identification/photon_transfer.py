@@ -1,4 +1,4 @@
-"""Photon transfer: a camera's temporal noise over its grey level, from flat frames or from fringes.
+"""Photon transfer: a camera's temporal noise over its grey level, from flat frames, fringes, or a code and its inverse.
 
 An electron makes K digital numbers (DN), and their number is Poisson, so a pixel's variance grows by K for each DN of its level.
 Variances are those of tiles of pixels, whose places are chosen before their values are seen: bins of level would pick noise.
@@ -7,18 +7,22 @@ What a lamp changes from frame to frame is smooth, or follows the scene: it is f
 Source: EMVA 1288, Release 4.0 (variance against mean); Sheppard 1898 (variance of rounding).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.structured_light.phase import design, pseudo_inverse
+from recon.model.patterns import AnyPart, Fringes, GrayCode, Patterns
+from recon.structured_light.phase import MIN_STEPS_FOR_NOISE, design, pseudo_inverse
 
 Array = NDArray[np.float64]
 
 ROUNDING = 1 / 12  # DN^2, of whole numbers
 TILE = 16  # px, side of a tile: small against the lighting, and 256 pixels know their variance to 9 % from one pair of frames
+AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.float32)
 ROUNDS = 4  # of weights by the line that was fitted with the last ones
 
 
@@ -32,6 +36,8 @@ class TransferLimits:
     tiles: int = 16  # at least; their scatter is the line's uncertainty
     harmonics: int = 3  # of fringes, which a projector's gamma adds with some strength, and which are left out
     locked: int = 5  # harmonics of the fringes that a frame's error may show in a tile
+    pairs: int = 3  # images of a code with their inverses, at least
+    sets: int = 3  # of fringes of few steps, at least
 
 
 LIMITS = TransferLimits()
@@ -100,6 +106,44 @@ def noise_of_flat(frames: NDArray, bits: int) -> TileNoise:
     return TileNoise(level[usable], variance[usable], np.full(np.count_nonzero(usable), float(freedom)))
 
 
+def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoise | None:
+    """Temporal noise of a sequence of patterns on any steady scene, of all parts that show it.
+
+    Those are fringes of eight steps or more, an even number of them if binary, and codes with the inverse of each image; without
+    any of these, three sets of grey fringes or more.
+
+    Parameters
+    ----------
+    images : (n, h, w), DN
+        One an image of the sequence.
+    bits : int
+        Of the images.
+
+    Returns
+    -------
+    TileNoise or None
+        None if no part shows it.
+    """
+    found = []
+    for part, place in patterns.slices():
+        if isinstance(part, GrayCode) and has_free_dimensions(part):
+            found.append(noise_of_inverses(images[place], bits))
+        elif isinstance(part, Fringes) and has_free_dimensions(part):
+            measure = noise_of_fringes if part.waveform == "sine" else noise_of_binary_fringes
+            found.append(measure(images[place], part.shifts, bits))
+    grey = [(part, place) for part, place in patterns.slices() if isinstance(part, Fringes) and part.waveform == "sine"]
+    if not found and len(grey) >= LIMITS.sets:
+        found.append(noise_of_offsets([images[place] for _, place in grey], [part.shifts for part, _ in grey], bits))
+    return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
+
+
+def has_free_dimensions(part: AnyPart) -> bool:
+    """Whether a part's images by themselves hold noise that isn't light."""
+    if isinstance(part, GrayCode):
+        return part.inverted and part.count >= 2 * LIMITS.pairs
+    return isinstance(part, Fringes) and part.steps >= MIN_STEPS_FOR_NOISE and (part.waveform == "sine" or part.steps % 2 == 0)
+
+
 def noise_of_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
     """Temporal noise of a sequence of shifted fringes on any steady scene.
 
@@ -120,9 +164,95 @@ def noise_of_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
         If there are too few images to leave a dimension for noise, or shifts leave the phase undetermined.
     """
     highest = min(LIMITS.harmonics, (len(shifts) - 2) // 2)
-    waves = design(shifts, highest)
     if highest < 1 or len(shifts) != len(images):
         raise ValueError(f"expected n >= 4 images (n, h, w) and n shifts, found {images.shape} and {len(shifts)} shifts")
+    return _noise_beside(images, shifts, design(shifts, highest), bits)
+
+
+def noise_of_binary_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
+    """Temporal noise of a sequence of binary fringes, as `noise_of_fringes`.
+
+    A wave that is lit for half of its period has odd harmonics only, behind any blur and any gamma. Of an even number of steps
+    these stay odd, so that the even ones hold noise and errors of frames.
+    """
+    if len(shifts) % 2 or len(shifts) < 4 or len(shifts) != len(images):
+        raise ValueError(f"expected an even number of 4 or more images and shifts, found {len(images)} and {len(shifts)}")
+    odd = np.arange(1, len(shifts) // 2 + 1, 2)
+    angles = np.outer(shifts, odd)
+    return _noise_beside(images, shifts, np.column_stack([np.ones(len(shifts)), np.cos(angles), np.sin(angles)]), bits)
+
+
+def noise_of_inverses(images: NDArray, bits: int) -> TileNoise:
+    """Temporal noise of binary patterns, each followed by its inverse, on any steady scene.
+
+    The light of both adds up to that of a uniform image, whatever the blur and the projector's gamma. What a frame's gain and
+    offset change in a tile of that sum is a combination of 1, the sum, and the sum where the first or the second was lit. Noise
+    of the sum is that of two levels, whose variances lie on the line: half of it is the variance at the mean level.
+
+    Parameters
+    ----------
+    images : (2 n, h, w), DN, n >= 3
+        By a camera with a linear response.
+    bits : int
+        Of the images. Tiles with a pixel that touches an end of their range are left out.
+    """
+    if len(images) % 2 or len(images) < 2 * LIMITS.pairs:
+        raise ValueError(f"expected {LIMITS.pairs} patterns or more with their inverses, found {len(images)} images")
+    tiles = in_tiles(images)
+    usable = (tiles.min(axis=(0, 2)) > 0) & (tiles.max(axis=(0, 2)) < 2**bits - 1)
+    around = [cv2.filter2D(image, cv2.CV_32F, AROUND) for image in images]  # of light, without the pixel's own noise
+    lit = np.stack([(one - other) / np.maximum(one + other, 1) for one, other in zip(around[0::2], around[1::2], strict=True)])
+    sums, lit = tiles[0::2, usable] + tiles[1::2, usable].astype(np.float32), in_tiles(lit)[:, usable]
+    scene, left = sums.mean(axis=0), np.empty_like(sums)
+    for _ in range(ROUNDS):  # of the scene, which errors of frames add to, and of these
+        for k in range(len(sums)):
+            shapes = np.stack([np.ones_like(scene), scene, scene * lit[k]], axis=1)  # (tiles, 3, pixels)
+            left[k] = _beside(sums[k] - scene, shapes)
+        scene = scene + left.mean(axis=0)
+    freedom = np.full(len(scene), (len(sums) - 1.0) * (TILE**2 - 3))
+    return TileNoise(scene.mean(axis=1) / 2, (left**2).sum(axis=(0, 2), dtype=float) / freedom / 2, freedom)
+
+
+def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int) -> TileNoise:
+    """Temporal noise of sets of shifted fringes of few steps on any steady scene, by their mean light, which is the same.
+
+    A gamma adds the harmonic of as many periods as there are steps; gains and shifts of frames add 1, the light, the fringe
+    and its second harmonic.
+
+    Parameters
+    ----------
+    sets : (n, h, w) each, DN, three or more of any pitches and axes
+    shifts : (n,) rad each
+    bits : int
+        Of the images. Tiles with a pixel that touches an end of their range are left out.
+    """
+    if len(sets) < LIMITS.sets or len(sets) != len(shifts):
+        raise ValueError(f"expected {LIMITS.sets} sets or more with their shifts, found {len(sets)} and {len(shifts)}")
+    tiles, steps = [in_tiles(images) for images in sets], np.array([len(images) for images in sets])
+    usable = np.all([(one.min(axis=(0, 2)) > 0) & (one.max(axis=(0, 2)) < 2**bits - 1) for one in tiles], axis=0)
+    offsets = [
+        np.tensordot(pseudo_inverse(turns)[0], one[:, usable].astype(float), 1) for turns, one in zip(shifts, tiles, strict=True)
+    ]
+    scene = np.average(offsets, axis=0, weights=steps)
+    power = np.zeros(len(scene))
+    for n, turns, images, offset in zip(steps, shifts, sets, offsets, strict=True):
+        around = np.stack([cv2.filter2D(image, cv2.CV_32F, AROUND / 8) for image in images])  # without the pixel's own noise
+        c, s = in_tiles(np.tensordot(pseudo_inverse(turns)[1:], around, 1))[:, usable]
+        waves = [np.hypot(c, s) * np.exp(1j * m * np.arctan2(s, c)) for m in (1, 2, n)]
+        shapes = [np.ones_like(scene), scene, *(one for wave in waves for one in (wave.real, wave.imag))]
+        power += n * (_beside(offset - scene, np.stack(shapes, axis=1)) ** 2).sum(axis=1)
+    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - 8))  # less the shapes
+    return TileNoise(scene.mean(axis=1), power / freedom, freedom)
+
+
+def _beside(values: NDArray, shapes: NDArray) -> NDArray:
+    """What is left of tiles' values (t, p) by least squares with shapes (t, m, p)."""
+    inverse = np.linalg.pinv(shapes @ shapes.swapaxes(1, 2), hermitian=True)
+    return values - ((shapes @ values[..., None]).swapaxes(1, 2) @ inverse @ shapes)[:, 0]
+
+
+def _noise_beside(images: NDArray, shifts: Array, waves: Array, bits: int) -> TileNoise:
+    """Noise in the dimensions of a pixel's values beside those, (n, m), that fringes fill."""
     tiles = in_tiles(images)
     usable = (tiles.min(axis=(0, 2)) > 0) & (tiles.max(axis=(0, 2)) < 2**bits - 1)
     values = tiles[:, usable].astype(float)
@@ -130,7 +260,7 @@ def noise_of_fringes(images: NDArray, shifts: Array, bits: int) -> TileNoise:
     phasor, turn = c + 1j * s, np.exp(1j * np.angle(c + 1j * s))
     powers = [phasor * turn**m for m in range(LIMITS.locked)]
     shapes = np.stack([np.ones_like(offset), offset, *(part for z in powers for part in (z.real, z.imag))], axis=-1)
-    left = np.linalg.svd(waves.T)[2][waves.shape[1] :]  # (dimensions, n), orthonormal, without the fringe
+    left = np.linalg.svd(waves.T)[2][np.linalg.matrix_rank(waves) :]  # (dimensions, n), orthonormal, without the fringe
     basis = _orthonormal(shapes)
     noise = np.tensordot(left, values, 1)
     noise -= np.einsum("tpm,tqm,ktq->ktp", basis, basis, noise, optimize=True)

@@ -216,16 +216,26 @@ def sample(
     axes = [axis for axis in patterns.axes if patterns.has_fringes(axis) and axis in maps]
     if axes != list(patterns.axes):
         raise InputError("identify: expected fringes, found Gray code alone, which places pixels to a cell only")
-    good = (found.status == Status.OK) & (found.modulation > selection.modulation_dn * (2**bits - 1) / 255)
     # By means of windows: pixels whose own noise spares them from being clipped have too bright a dark
     window = (selection.window, selection.window)
     means = np.stack([cv2.blur(image.astype(np.float32), window) for image in images])
     brightest, darkest, noise = means.max(axis=0), means.min(axis=0), found.noise
-    good &= brightest + CLEAR * np.sqrt(noise.read_variance + noise.gain * brightest) < 2**bits - 1
-    good &= (darkest > CLEAR * np.sqrt(noise.read_variance)) & np.isfinite(points.points[..., 2])
+    good, full = (found.status == Status.OK) & np.isfinite(points.points[..., 2]), 2**bits - 1
+    wanted = {
+        f"the modulation is below {selection.modulation_dn:g} of 255": found.modulation > selection.modulation_dn * full / 255,
+        "bright stripes are saturated": brightest + CLEAR * np.sqrt(noise.read_variance + noise.gain * brightest) < full,
+        "dark stripes are at 0, the end of the range": darkest > CLEAR * np.sqrt(noise.read_variance),
+    }
     for axis in axes:
-        sigma = maps[axis][1]
-        good &= np.nan_to_num(sigma, nan=np.inf) < selection.place_px
+        sigma = np.nan_to_num(maps[axis][1], nan=np.inf)
+        known = f"known to {np.median(sigma[good]) if good.any() else np.inf:.2g} px in the median, not to {selection.place_px:g}"
+        wanted[f"{axis} are {known}: finer fringes or more steps are needed"] = sigma < selection.place_px
+    cause = "nothing was decoded" if np.count_nonzero(good) < selection.fewest else "the surface isn't smooth"
+    for reason, those in wanted.items():
+        enough = np.count_nonzero(good) >= selection.fewest
+        good &= those
+        if enough and np.count_nonzero(good) < selection.fewest:
+            cause = reason
     inside = cv2.erode(good.astype(np.uint8), np.ones(window, np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     v, u = np.nonzero(inside)
     chosen = np.sort(np.random.default_rng(0).permutation(len(v))[: 2 * selection.pixels])
@@ -241,7 +251,7 @@ def sample(
     kept = kept[np.linspace(0, len(kept) - 1, min(len(kept), selection.pixels)).astype(int)] if kept.size else kept
     if len(kept) < selection.fewest:
         raise InputError(
-            f"identify: expected {selection.fewest} bright pixels on smooth surfaces, found {len(kept)}: another surface?"
+            f"identify: expected {selection.fewest} pixels of bright fringes on a smooth surface, found {len(kept)}: {cause}"
         )
     v, u = v[kept], u[kept]
     local = rigid.apply(projector.camera_from_world, points.points[v, u].astype(float))

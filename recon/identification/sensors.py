@@ -1,4 +1,4 @@
-"""A camera's sensor by the figures of EMVA 1288, from its dark frames, flat frames and fringes.
+"""A camera's sensor by the figures of EMVA 1288, from its dark frames, flat frames, fringes and codes.
 
 Photon transfer gives the gain K in digital numbers (DN) an electron, dark frames the black level, dark noise and DSNU, flat
 frames the PRNU. With `black` the black level, `K saturation_e = gain (2^bits - 2^(bits - 8) black_level_dn)`.
@@ -11,7 +11,7 @@ Source: EMVA 1288, Release 4.0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,14 +22,18 @@ from recon.identification.estimates import Estimate, Findings
 from recon.identification.photon_transfer import (
     PhotonTransfer,
     TileNoise,
+    has_free_dimensions,
     noise_of_flat,
-    noise_of_fringes,
+    noise_of_patterns,
     transfer_line,
 )
 from recon.identification.pixel_response import pixel_response
+from recon.model.patterns import Patterns
+from recon.model.rig import Sensor
 
 Array = NDArray[np.float64]
 
+NOISE = "noise_at_zero_dn2."  # of a camera: its line of variance over level, 8-bit DN^2, at level 0
 UNIFORM = 1 / np.sqrt(12)  # standard deviation of a range of 1
 NO_LINE = PhotonTransfer(1.0, 0.0, np.diag([1e-12, 1e12]), 0.0, 0.0)  # without a gain, electrons stand for DN
 
@@ -43,6 +47,7 @@ class SensorLimits:
     exposure_s: float = 1 / 30  # at most, where it isn't known
     black_level_dn: float = 16.0  # at most, 8-bit; where no dark frames measure it
     gain: float = 0.2  # relative standard deviation of K, at most
+    few_steps: float = 0.05  # relative standard deviation of K by sets of few steps: six poses of a public board scatter by 3 %
     dark: float = 0.3  # of dark noise and DSNU, at most; a DSNU is known as well where it is surely less than the noise
     dark_noise_e: float = 40.0  # at most; where no dark frames measure it
     one_value: float = 0.3  # DN, scatter of dark frames that show one value: the black level lies anywhere within its step
@@ -78,11 +83,11 @@ class DarkStack(NamedTuple):
     exposure_s: float | None = None
 
 
-class FringeStack(NamedTuple):
-    """A sequence of shifted fringes on any steady scene."""
+class PatternStack(NamedTuple):
+    """A sequence of patterns on any steady scene."""
 
-    images: NDArray  # (n, h, w), n >= 8
-    shifts: Array  # (n,) rad
+    images: NDArray  # (n, h, w), one an image of the sequence
+    patterns: Patterns
 
 
 def identify_sensor(
@@ -91,7 +96,7 @@ def identify_sensor(
     *,
     dark: Sequence[DarkStack] = (),
     flats: Sequence[NDArray] = (),
-    fringes: Sequence[FringeStack] = (),
+    sequences: Sequence[PatternStack] = (),
 ) -> Findings:
     """Measure a sensor.
 
@@ -103,7 +108,8 @@ def identify_sensor(
         The shortest exposure gives the figures, the longest the dark current.
     flats : (m, h, w) each, m >= 2
         Frames of one steady, smooth light; best of two levels or more, with some hundreds of electrons at least.
-    fringes : FringeStack
+    sequences : PatternStack
+        With eight steps of fringes or more, three sets of fewer, or a code and its inverses.
 
     Returns
     -------
@@ -111,14 +117,15 @@ def identify_sensor(
         `CAMERA.sensor.FIELD` for all fields but the pixel's size.
     """
     n = camera + ".sensor."
-    line, seen = _line(settings, flats, fringes)
+    line, seen = _line(settings, flats, sequences)
     unknown = {
         n + "quantum_efficiency": "images count electrons; the light's power on a pixel isn't known, so photons aren't",
         n + "adc_bits": f"images of {settings.bits} bits leave out what the ADC has below them: see the data sheet",
         n + "dark_current_e_per_s": "needs dark frames of two exposures, and a gain",
     }
     if line is None:
-        why = "needs flat frames, or fringes, with a noise of 0.6 DN or more, at several levels or with dark frames"
+        patterns = "eight steps of fringes, three sets of fewer, or a code with its inverses"
+        why = f"needs flat frames, or {patterns}, with a noise of 0.6 DN or more, at several levels or with dark frames"
         unknown |= dict.fromkeys((n + "saturation_e", n + "prnu"), why)
     found = Findings({}, unknown)
     stacks = sorted(dark, key=lambda stack: stack.exposure_s or 0.0)
@@ -129,26 +136,49 @@ def identify_sensor(
     return found
 
 
+def with_noise_as_seen(sensor: Sensor, camera: str, settings: ImageSettings, found: Findings) -> Sensor:
+    """A sensor whose dark noise and black level are known together only, so that its noise is the one that was seen.
+
+    The black level stays as it is assumed, and the dark noise makes up for it; where that can't be, there is none, and the black
+    level is what it must be.
+    """
+    if NOISE + camera not in found.estimates:
+        return sensor
+    full, cut_off = 2.0 ** (settings.bits - 8), 0.5 - settings.step[0]
+    gain, at_zero = _range(settings, sensor.black_level_dn) / sensor.saturation_e, found.estimates[NOISE + camera].value * full**2
+    dark = at_zero + gain * (full * sensor.black_level_dn - cut_off)
+    black = sensor.black_level_dn if dark >= 0 else (cut_off - at_zero / gain) / full
+    return sensor.model_copy(update={"dark_noise_e": float(np.sqrt(max(dark, 0.0)) / gain), "black_level_dn": float(black)})
+
+
 def _range(settings: ImageSettings, black_level_dn: float) -> float:
     """Digital numbers that `saturation_e` fills, times the camera's gain."""
     gain = 1.0 if settings.gain is None else settings.gain
     return gain * 2.0 ** (settings.bits - 8) * (256 - black_level_dn)
 
 
-def _line(settings: ImageSettings, flats: Sequence[NDArray], fringes: Sequence[FringeStack]) -> tuple[PhotonTransfer | None, str]:
-    """Photon transfer of flat frames, or of fringes where there are none, and their names.
+def _line(
+    settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]
+) -> tuple[PhotonTransfer | None, str]:
+    """Photon transfer of flat frames, or of patterns where there are none, and their names.
 
     Fringes of a scene leave some tenths of a per cent in the variance, which many flat frames would be known better than.
     """
     if flats:
         tiles, names = [noise_of_flat(frames, settings.bits) for frames in flats], f"{sum(map(len, flats))} flat frames"
-    elif fringes:
-        tiles = [noise_of_fringes(stack.images, stack.shifts, settings.bits) for stack in fringes]
-        names = f"{sum(len(stack.images) for stack in fringes)} fringe images"
     else:
+        found = [noise_of_patterns(stack.images, stack.patterns, settings.bits) for stack in sequences]
+        tiles, names = (
+            [one for one in found if one is not None],
+            f"{sum(len(stack.images) for stack in sequences)} images of patterns",
+        )
+    if not tiles:
         return None, ""
     gain = " at gain 1, as the camera's isn't known" if settings.gain is None else ""
-    return transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))), names + gain
+    line = transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True))))
+    if line is not None and not flats and not any(has_free_dimensions(part) for one in sequences for part in one.patterns.parts):
+        line = replace(line, covariance=line.covariance + np.diag([(LIMITS.few_steps * line.gain) ** 2, 0.0]))
+    return line, names + gain
 
 
 def _without_dark(n: str, settings: ImageSettings, line: PhotonTransfer | None, seen: str, flats: Sequence[NDArray]) -> Findings:
@@ -170,7 +200,10 @@ def _without_dark(n: str, settings: ImageSettings, line: PhotonTransfer | None, 
     )
     unknown = {n + "black_level_dn": together, n + "dark_noise_e": together, n + "dsnu_e": why}
     gain = line.gain, float(np.sqrt(line.covariance[0, 0]))
-    found = Findings({n + "saturation_e": _saturation(settings, gain, black, seen)}, unknown)
+    at_zero = Estimate(line.intercept / full**2, float(np.sqrt(line.covariance[1, 1])) / full**2, seen)
+    found = Findings(
+        {n + "saturation_e": _saturation(settings, gain, black, seen), NOISE + n.partition(".")[0]: at_zero}, unknown
+    )
     return found | _prnu(n, settings, line, flats, black, None)
 
 
@@ -208,7 +241,7 @@ def _from_dark(
     found |= Findings({n + "black_level_dn": Estimate(max(black / full, 0.0), black_sigma / full, source)})
     if line is None:
         by_names = {"dark_noise_e": fit.noise, "dsnu_e": fit.spread}
-        why = "{:.3g} to {:.3g} DN; electrons need a gain, by flat frames or fringes"
+        why = "{:.3g} to {:.3g} DN; electrons need a gain, by flat frames or patterns"
         return found | Findings({}, {n + name: why.format(*range_dn) for name, range_dn in by_names.items()})
     both = f"{source} and {seen}"
     if fit.gain.sigma > LIMITS.gain * gain:

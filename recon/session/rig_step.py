@@ -24,18 +24,16 @@ from recon.files import atomic, yaml_text
 from recon.identification import calibrated_optics, lenses, projector, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur
-from recon.identification.sensors import DarkStack, FringeStack, ImageSettings
+from recon.identification.sensors import DarkStack, ImageSettings, PatternStack
 from recon.model.boards import Discs
 from recon.model.calibration import Calibration
 from recon.model.part import Part, Positive
-from recon.model.patterns import Fringes
 from recon.model.rig import Measured, Rig
 from recon.optical_calibration.joint_calibration import Result
 from recon.registry import Choice
 from recon.session import hand_step, optics_step, scanner_step
 from recon.session.scanner_step import ULTRASOUND, Found
 from recon.session.watch import SILENT, Watch
-from recon.structured_light import phase
 from recon.structured_light.decode import decode
 from recon.structured_light.triangulate import triangulate
 
@@ -44,6 +42,7 @@ RIG, CONDITIONS, FIGURES = "rig.yaml", "conditions.yaml", "identified.json"
 GROUP = "conditions."
 CAMERAS = ("cam1", "cam2")
 BLUR_SIGMA_PX = 0.15, 0.5  # of a camera's point spread where no board showed it, and with its defocus where none showed this
+NOISE_POSES = 3  # of a board whose fringes tell the noise: tiles enough
 BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
 
 LENS = ("f_number", "focus_mm", "blur_px", "vignetting")
@@ -204,7 +203,7 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
     found |= calibrated_optics.findings(calibration)
     for camera, own in frames.items():
         with watch.busy(f"measuring the sensor of {camera}"):
-            found |= _sensor(camera, settings, own, shots.get(camera))
+            found |= _sensor(camera, settings, own, list(_stacks(camera, shots.get(camera), board)))
     if board is not None:
         with watch.busy("measuring the lenses"):
             found |= _lenses(*board, rig, found)
@@ -217,6 +216,12 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
         rig = rig.model_copy(
             update={camera: getattr(rig, camera).model_copy(update={"sensor": one}) for camera, one in sensors_of.items()}
         )
+    for camera, own in frames.items():
+        if all(_known(f"{camera}.sensor.{name}", rig, found) is None for name in ("dark_noise_e", "black_level_dn")):
+            device = getattr(rig, camera)
+            image = ImageSettings(own.device.bits, _gain(settings, own.device), settings.adc_bits)
+            sensor = sensors.with_noise_as_seen(getattr(rig_file.apply(rig, found), camera).sensor, camera, image, found)
+            rig = rig.model_copy(update={camera: device.model_copy(update={"sensor": sensor})})
     if "projector.lens.focus_mm" not in rig.measured:
         rig = rig.model_copy(update={"projector": projector.with_blur_as_seen(rig.projector, found)})
     return rig, found
@@ -275,22 +280,31 @@ def _films(settings: Settings, rig: Rig, calibration: Calibration | None, watch:
     return found | hand_step.compare_probes(settings.probes)
 
 
-def _sensor(camera: str, settings: Settings, frames: _Frames, shot: SurfaceCapture | None) -> Findings:
+def _stacks(camera: str, shot: SurfaceCapture | None, board: tuple[BoardCapture, Result] | None) -> Iterator[PatternStack]:
+    """Sequences that a camera saw: of the surface, or else of the board's first poses."""
+    if shot is not None:
+        yield PatternStack(shot.images, shot.patterns)
+    elif board is not None and camera == board_part.FRINGE_CAMERA and board[0].patterns is not None:
+        lit = [number for number, record in enumerate(board[0].records) if camera in record.fringes]
+        for number in lit[:NOISE_POSES]:
+            fringes = board[0].pose(number).fringes
+            if fringes is not None:
+                yield PatternStack(fringes, board[0].patterns)
+
+
+def _sensor(camera: str, settings: Settings, frames: _Frames, sequences: Sequence[PatternStack]) -> Findings:
     device, dark = frames.device, frames.dark
-    fringes = []
-    if shot is not None:  # harmonics of binary fringes look like noise
-        sets = [(part, place) for part, place in shot.patterns.slices() if isinstance(part, Fringes) and part.waveform == "sine"]
-        fringes = [
-            FringeStack(shot.images[place], part.shifts) for part, place in sets if part.steps >= phase.MIN_STEPS_FOR_NOISE
-        ]
-    gain = device.gain if settings.gain is None else settings.gain
     return sensors.identify_sensor(
         camera,
-        ImageSettings(device.bits, gain, settings.adc_bits),
+        ImageSettings(device.bits, _gain(settings, device), settings.adc_bits),
         dark=[] if dark is None else [DarkStack(dark, device.exposure_s)],
         flats=frames.flats,
-        fringes=fringes,
+        sequences=sequences,
     )
+
+
+def _gain(settings: Settings, device: Device) -> float | None:
+    return device.gain if settings.gain is None else settings.gain
 
 
 def _lenses(captured: BoardCapture, optics: Result, rig: Rig, known: Findings) -> Findings:

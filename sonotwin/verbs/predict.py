@@ -7,9 +7,9 @@ per cent it changes for one per cent of each number of the rig, where it does: -
 first. Takes some seconds.
 
 The noise of camera 1, the projector's raster and the errors of a calibration whose covariance the rig has are in it; flicker, and
-light that spreads in skin, aren't. With `sessions` whole ones are drawn, from the board to a mass, with the errors of
-`conditions`: what detectors would find is drawn, and the real software does the rest. They say the errors of points, pixels of
-B-scans and masses' centres.
+light that spreads in skin, aren't. Fringes along columns, rows or both count as in the reconstruction. With `sessions` whole ones
+are drawn, from the board to a mass, with the errors of `conditions`: what detectors would find is drawn, and the real software
+does the rest. They say the errors of points, pixels of B-scans and masses' centres.
 
     sonotwin predict
     sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700]
@@ -95,7 +95,8 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
     known = f"± {1.96 * sigma:.4f} mm (95 %, by {len(rig.measured)} measured numbers, if all others are as the rig has them)"
     unknown = "of unknown uncertainty: none of the rig's numbers was measured, see `sonotwin identify`"
     yield f"predicted   plane {found.rms_mm:.4f} mm RMS, {known if rig.measured else unknown}"
-    parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm, calibration {found.optics_mm:.4f} mm"
+    optics = "not counted (no covariance in the rig)" if rig.optics_covariance is None else f"{found.optics_mm:.4f} mm"
+    parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm, calibration {optics}"
     yield f"by          {parts}; modulation {found.modulation_dn:.0f} DN, exposure {1e3 * found.exposure_s:.2f} ms"
     if config.sessions:
         for figure, one in predicted_session.predict(_session(config), range(config.sessions)).items():

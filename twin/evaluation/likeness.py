@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
 from recon.errors import InputError
-from recon.identification.photon_transfer import TileNoise, noise_of_fringes
+from recon.identification.photon_transfer import TileNoise, noise_of_patterns
 from recon.model.patterns import Fringes, Patterns
 from recon.structured_light import frame_errors
 from recon.structured_light.decode import ProjectorMap, Status
@@ -147,7 +147,7 @@ class Likeness:
     """All that is compared."""
 
     compared: Mask
-    noise: LevelNoise | None  # None where fringes have fewer than eight steps
+    noise: LevelNoise | None  # None without eight steps of fringes, or a code with its inverse
     temporal: Spectrum | None  # over harmonics of the sequence
     spatial: Spectrum | None  # over cycles a px
     frames: FrameScatter | None
@@ -236,13 +236,8 @@ def level_noise(real: Taken, twin: Taken, both: Mask) -> LevelNoise | None:
 
 def _tiles(side: Taken, both: Mask) -> TileNoise | None:
     """Noise of tiles within the compared pixels."""
-    found = [
-        noise_of_fringes(np.where(both, images, 0), part.shifts, side.bits)  # a tile that touches 0 is left out
-        for part, images in side.fringes()
-        if part.steps >= MIN_STEPS_FOR_NOISE
-    ]
-    found = [one for one in found if len(one.level)]
-    return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
+    found = noise_of_patterns(np.where(both, side.images, 0), side.patterns, side.bits)  # a tile that touches 0 is left out
+    return found if found is not None and len(found.level) else None
 
 
 def frame_scatter(real: Taken, both: Mask, expected: Frames, dark_dn: float) -> FrameScatter | None:

@@ -13,7 +13,7 @@ from recon.geometry.camera import Array, Camera
 from recon.geometry.camera_jacobian import linearise
 from recon.geometry.primitives import Plane
 from recon.model import circle_layout
-from recon.model.patterns import Fringes, Patterns
+from recon.model.patterns import Axis, Fringes, Patterns
 from recon.model.rig import CameraDevice, ProjectorDevice, Rig, Target
 from twin.sensor import Exposure, noise_dn, number_per_electron
 
@@ -23,11 +23,12 @@ EXACT_MM2 = 1e-8  # variance of a length that is known
 WAVE = 4096  # steps of a period, of which the first harmonic is taken
 
 
-def fringes_of(patterns: Patterns) -> Fringes:
-    """The finest fringes along the columns, which measure."""
-    return min(
-        (part for part in patterns.parts if isinstance(part, Fringes) and part.axis == "columns"), key=lambda part: part.pitch
-    )
+def fringes_of(patterns: Patterns, axis: Axis = "columns") -> Fringes:
+    """The finest fringes along an axis, which measure; raises ValueError without any."""
+    found = [part for part in patterns.parts if isinstance(part, Fringes) and part.axis == axis]
+    if not found:
+        raise ValueError(f"patterns: expected fringes along the {axis}, found none")
+    return min(found, key=lambda part: part.pitch)
 
 
 def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
@@ -103,21 +104,22 @@ def plane_sigma(rig: Rig, plane: Plane, column_sigma: float) -> float:
 def _mm_a_column(camera: Camera, projector: Camera, plane: Plane) -> Array:
     """Distance from a plane, mm, by which a point moves a column of the projector, over what both see of it."""
     across, down = (np.linspace(0, length - 1, steps) for length, steps in zip(camera.size, GRID, strict=True))
-    return seen_points(camera, projector, plane, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))[1]
+    return seen_points(camera, projector, plane, np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))[1][:, 0]
 
 
 def seen_points(camera: Camera, projector: Camera, plane: Plane, pixels: Array) -> tuple[Array, Array]:
     """Points : (n, 3) mm of a plane at those pixels : (m, 2) of a camera that the projector reaches.
 
-    And by how much, mm, a point leaves the plane for a px of the projector's column : (n,).
+    And by how much, mm, a point leaves the plane for a px of the projector's column, and of its row : (n, 2).
     """
     rays = camera.rays(pixels)
     cosine = rays @ plane.normal
     points = camera.centre + rays * (((plane.point - camera.centre) @ plane.normal) / cosine)[:, None]
-    columns = [projector.project(points + side * STEP_MM * rays) for side in (-1, 0, 1)]
-    seen = ((columns[1] > -0.5) & (columns[1] < np.array(projector.size) - 0.5)).all(axis=1)
-    slope = (columns[2] - columns[0])[:, 0] / (2 * STEP_MM)
-    return points[seen], (np.abs(cosine) / np.abs(slope))[seen]
+    places = [projector.project(points + side * STEP_MM * rays) for side in (-1, 0, 1)]
+    seen = ((places[1] > -0.5) & (places[1] < np.array(projector.size) - 0.5)).all(axis=1)
+    slope = (places[2] - places[0]) / (2 * STEP_MM)
+    with np.errstate(divide="ignore"):  # an axis beside which the camera stands shows no depth
+        return points[seen], (np.abs(cosine)[:, None] / np.abs(slope))[seen]
 
 
 def brightness_noise(camera: CameraDevice, brightness_dn: float, exposure: Exposure) -> float:

@@ -1,8 +1,9 @@
 """The error of a plane that a rig will find, before anything is recorded, from its description; and what would lower it.
 
 At places all over the view: the light that comes back, the noise and the modulation of the finest fringes in it, the phase's
-error, and the plane's by the slope of the projector's column along the camera's ray; and what a calibration with covariance lets
-the plane bend. What is left of frames' errors after the decoder took them off is not in it.
+error, and the plane's by the slope of the projector's column along the camera's ray, or row, or both as they are weighed by the
+triangulation; and what a calibration with covariance lets the plane bend. What is left of frames' errors after the decoder took
+them off is not in it.
 
 Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise.
 """
@@ -19,7 +20,7 @@ from recon.geometry.camera import Array
 from recon.geometry.primitives import Plane
 from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
-from recon.model.patterns import Fringes, Patterns
+from recon.model.patterns import Axis, Fringes, Patterns
 from recon.model.rig import CameraDevice, ProjectorDevice, Rig
 from recon.optical_calibration import uncertainty as calibrated
 from scenes.kinds import plane
@@ -28,6 +29,8 @@ from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.sensor import Exposure, electrons_per_radiance, noise_dn, number_per_electron
 
+AXES: tuple[Axis, ...] = ("columns", "rows")  # in the order of a projector's coordinates
+ON_RAYS = 1e-3  # error of camera 1's pixels over the projector's: their rays are exact
 GRID = (17, 13)  # places over camera 1's image, across and down
 WAVE = 512  # steps of a period
 BRIGHTEST = 99.0  # percentile of the places, at which the exposure is set; there are fewer than pixels
@@ -53,7 +56,7 @@ class Prediction(NamedTuple):
     mirrors_mm: float  # by the projector's raster alone
     optics_mm: float  # by errors of the calibration alone, as they are expected; 0 if the rig has no covariance
     optics_sigma_mm2: float  # standard deviation of the square of that, from one calibration to the next
-    modulation_dn: float  # median
+    modulation_dn: float  # median, of the axis that counts most
     exposure_s: float
     common_view: float  # of camera 1's pixels, on a plane that is larger than its view
 
@@ -64,16 +67,20 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     Raises
     ------
     ValueError
-        If camera 1 and the projector see nothing of it together.
+        If camera 1 and the projector see nothing of it together, or the patterns have no fringes.
     """
-    fringes = closed_forms.fringes_of(measurement.patterns)
+    axes: list[Axis] = [axis for axis in measurement.patterns.axes if measurement.patterns.has_fringes(axis)]
+    if axes != list(measurement.patterns.axes):
+        raise ValueError("patterns: expected fringes, found Gray code alone, which errs by its cells")
+    sets = [closed_forms.fringes_of(measurement.patterns, axis) for axis in axes]
     (flat,) = (shape for shape in plane.build(measurement.plate).shapes if isinstance(shape, Plane))
     points, slopes = _seen(rig, flat, measurement.plate)
     radiance = _radiance(rig, points, flat.normal, measurement.plate.reflectance)
     room = measurement.plate.reflectance * measurement.tracing.room_radiance * _passed(rig.cam1, points)
-    mean, amplitude, second, peak = _wave(rig, fringes, points)
+    waves = [_wave(rig, fringes, points) for fringes in sets]
+    peak = np.max([wave.peak for wave in waves], axis=0)
     if any(not isinstance(part, Fringes) for part in measurement.patterns.parts):
-        peak = np.ones_like(mean)  # a code's stripes, or a uniform image
+        peak = np.ones_like(peak)  # a code's stripes, or a uniform image
     electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
     shooting, sensor = measurement.shooting, rig.cam1.sensor
     brightest = float(np.percentile(radiance * peak + room, BRIGHTEST)) * electron  # a second
@@ -84,15 +91,20 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
         raise ValueError(f"shooting.exposure_s: {expected}, found {1e3 * time_s:.3g} ms")
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
     per_electron = number_per_electron(sensor, exposure)
-    weighed = mean - second / 2  # light at the steps by which the phase is known, where the wave is steep: weights are sin^2
-    counted_e = (radiance * weighed + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
-    modulation = radiance * amplitude * electron * time_s * per_electron
-    noise = noise_dn(np.float32(counted_e), sensor, exposure)
-    by_noise = np.sqrt(2 / fringes.steps) * noise / modulation
-    by_mirrors = closed_forms.raster_sigma(rig, fringes, points)
-    mm_a_rad = fringes.pitch / (2 * np.pi) * slopes
-    noise_mm, mirrors_mm = (float(np.sqrt(np.mean((mm_a_rad * error) ** 2))) for error in (by_noise, by_mirrors))
-    bent2, bent2_sigma = _bent(rig, points, flat.normal)
+    by_noise, by_mirrors, modulations, sigma_px = [], [], [], dict[Axis, float]()
+    for fringes, wave, mm_a_px in zip(sets, waves, slopes.T[[AXES.index(axis) for axis in axes]], strict=True):
+        weighed = wave.mean - wave.second / 2  # light at the steps by which the phase is known, where it is steep: sin^2
+        counted_e = (radiance * weighed + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
+        modulations.append(radiance * wave.amplitude * electron * time_s * per_electron)
+        noise, mm_a_rad = noise_dn(np.float32(counted_e), sensor, exposure), fringes.pitch / (2 * np.pi) * mm_a_px
+        phase = np.sqrt(2 / fringes.steps) * noise / modulations[-1]
+        sigma_px[fringes.axis] = float(np.median(phase)) * fringes.pitch / (2 * np.pi)
+        by_noise.append(mm_a_rad * phase)
+        by_mirrors.append(mm_a_rad * closed_forms.raster_sigma(rig, fringes, points))
+    weights = np.array(by_noise) ** -2.0
+    weights /= weights.sum(axis=0)
+    noise_mm, mirrors_mm = (float(np.sqrt(np.mean(np.nansum((weights * one) ** 2, axis=0)))) for one in (by_noise, by_mirrors))
+    bent2, bent2_sigma = _bent(rig, points, flat.normal, sigma_px)
     view = len(points) / (GRID[0] * GRID[1])
     return Prediction(
         float(np.sqrt(noise_mm**2 + mirrors_mm**2 + bent2)),
@@ -100,23 +112,23 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
         mirrors_mm,
         float(np.sqrt(bent2)),
         bent2_sigma,
-        float(np.median(modulation)),
+        float(np.median(modulations[int(np.argmax(weights.mean(axis=1)))])),
         time_s,
         view,
     )
 
 
 def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:
-    """Points : (n, 3) mm of the plate that camera 1 and projector see, and the plane's error, mm, for a column's, px : (n,)."""
+    """Points : (n, 3) mm of the plate that both devices see; the plane's error, mm, for a column's, px, and a row's : (n, 2)."""
     camera, projector = rig.cam1.optics.camera(), rig.projector.optics.camera()
     across, down = ((np.arange(steps) + 0.5) / steps * length - 0.5 for length, steps in zip(camera.size, GRID, strict=True))
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    points, mm_a_column = closed_forms.seen_points(camera, projector, flat, pixels)
+    points, mm_a_px = closed_forms.seen_points(camera, projector, flat, pixels)
     local = rigid.apply(rigid.invert(plane.tilted(plate.centre_mm, plate.tilt_deg)), points)
     seen = (np.abs(local[:, :2]) < np.array(plate.size_mm) / 2).all(axis=1)
     if not seen.any():
         raise ValueError("plate: expected it in view of camera 1 and the projector, found it in none or one of them")
-    return points[seen], mm_a_column[seen]
+    return points[seen], mm_a_px[seen]
 
 
 def _radiance(rig: Rig, points: Array, normal: Array, reflectance: float) -> Array:
@@ -147,17 +159,27 @@ def _corner2(device: CameraDevice | ProjectorDevice, points: Array) -> Array:
     return ((camera.project(points) - middle) ** 2).sum(axis=1) / (middle @ middle)
 
 
-def _wave(rig: Rig, fringes: Fringes, points: Array) -> tuple[Array, Array, Array, Array]:
-    """Mean, amplitudes of two harmonics, and peak : (n,) of fringes' light at points with all blur, 1 for a pixel fully on."""
+class _Wave(NamedTuple):
+    """Fringes' light at points with all blur, 1 for a pixel fully on. All (n,)."""
+
+    mean: Array
+    amplitude: Array
+    second: Array  # harmonic
+    peak: Array
+
+
+def _wave(rig: Rig, fringes: Fringes, points: Array) -> _Wave:
     harmonics = np.fft.rfft(closed_forms.waveform(rig, fringes, WAVE)) / WAVE
     waves = np.arange(len(harmonics)) / fringes.pitch
     blurred = harmonics * np.sinc(waves) * closed_forms.transfer(rig, points, waves)
     peak = np.fft.irfft(blurred * WAVE, axis=-1).max(axis=-1)
-    return blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), 2 * blurred[:, 2].real, peak
+    return _Wave(blurred[:, 0].real, 2 * np.abs(blurred[:, 1]), 2 * blurred[:, 2].real, peak)
 
 
-def _bent(rig: Rig, points: Array, normal: Array) -> tuple[float, float]:
+def _bent(rig: Rig, points: Array, normal: Array, sigma_px: dict[Axis, float]) -> tuple[float, float]:
     """Mean square, mm^2, of a plane's points : (n, 3) about the plane fitted to them, and its standard deviation.
+
+    Points are on camera 1's rays, by the projector's columns and rows with weights by their standard deviations.
 
     By errors of the calibration, which are normal: of `z^T M z` with a covariance C, these are `tr(M C)` and
     `sqrt(2 tr(M C M C))`.
@@ -165,7 +187,8 @@ def _bent(rig: Rig, points: Array, normal: Array) -> tuple[float, float]:
     calibration = rig.calibration()
     if calibration.uncertainty is None:
         return 0.0, 0.0
-    slopes = calibrated.point_slopes(calibration, "cam1", "projector", points, (1.0, (1.0, np.inf)))
+    by_axis = [sigma_px.get(axis, np.inf) / min(sigma_px.values()) for axis in AXES]
+    slopes = calibrated.point_slopes(calibration, "cam1", "projector", points, (ON_RAYS, by_axis))
     along = np.einsum("i,nig->ng", normal, slopes)
     plane_terms = np.column_stack([np.ones(len(points)), points[:, :2]])  # in z a plane's, as it stands before the camera
     left = along - plane_terms @ np.linalg.lstsq(plane_terms, along)[0]

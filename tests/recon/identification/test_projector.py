@@ -1,8 +1,11 @@
 """A projector's gamma, blur, focus and contrast, and the frames' errors, are found from images as well as is said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from recon.errors import InputError
 from recon.identification import projector
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur, Selection
@@ -53,6 +56,25 @@ def test_intervals_of_drawn_projectors_hold_what_they_say(rig, rng):
         lenses += "projector.lens.focus_mm" in found.estimates
     held = np.mean(np.abs(off) < 1.96)
     assert held > 0.95 - 3 * np.sqrt(0.95 * 0.05 / len(off)) and np.std(off) > 0.5 and lenses >= 3
+
+
+def test_too_few_pixels_are_refused_with_the_cause(rig, rng):
+    """Clipped ends of the range, weak fringes, and coordinates that few steps know too badly; of images that are fine else."""
+    patterns, blur = read_patterns("gray_surface"), CameraBlur(0.5, CAMERA_SIGMA)
+    shown = fringe_images.photograph(rig.projector, Frames(), patterns, rig.cam1.sensor, (640.0, 680.0), 0.5, rng)
+    found, black = decode(shown.images, patterns), int(shown.images.min())
+    rough = replace(found, sigma_columns=np.full_like(found.sigma_columns, 0.5))
+    spoilt = {
+        "dark stripes are at 0": (np.maximum(shown.images, black + 9) - (black + 9), found),
+        "bright stripes are saturated": (np.where(shown.images > 40, 255, shown.images).astype(np.uint8), found),
+        "modulation is below 10 of 255": (shown.images, replace(found, modulation=found.modulation / 100)),
+        "columns are known to 0.5 px in the median, not to 0.2": (shown.images, rough),
+    }
+    devices = fringe_images.CAMERA, fringe_images.PROJECTOR
+    assert len(projector.sample(shown.images, patterns, found, shown.points, devices, blur).block) > 500
+    for cause, (images, one) in spoilt.items():
+        with pytest.raises(InputError, match=cause):
+            projector.sample(images, patterns, one, shown.points, devices, blur)
 
 
 @pytest.mark.slow

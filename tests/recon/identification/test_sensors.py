@@ -9,14 +9,29 @@ import pytest
 from scipy import stats
 
 from recon.identification.dark_frames import dark_moments, expected_moments, fit_dark
-from recon.identification.photon_transfer import PhotonTransfer, TileNoise, noise_of_fringes, transfer_line
-from recon.identification.sensors import DarkStack, FringeStack, ImageSettings, identify_sensor
+from recon.identification.photon_transfer import PhotonTransfer, TileNoise, noise_of_fringes, noise_of_patterns, transfer_line
+from recon.identification.sensors import (
+    DarkStack,
+    ImageSettings,
+    PatternStack,
+    identify_sensor,
+    with_noise_as_seen,
+)
+from recon.model.patterns import Patterns
 from recon.model.rig import Sensor
 from twin.sensor import Exposure, Numbers, fixed_pattern, noise_dn, readout_by, sensed
 
 SHAPE = 192, 256  # px: 192 tiles
 FRAMES = 6
 EXPOSURE_S = 1 / 60
+CODE = {"kind": "gray", "pitch": 16, "bits": 4}
+UNWRAPPED = [{"projector_size": (256, 192), "unwrap": unwrap} for unwrap in ("gray", "heterodyne")]
+SEQUENCES = {
+    "grey fringes": [{"kind": "fringes", "pitch": 16, "steps": 12}, CODE],
+    "binary fringes": [{"kind": "fringes", "pitch": 16, "steps": 8, "origin": 7.5, "waveform": "binary"}, CODE],
+    "three steps": [{"kind": "fringes", "pitch": pitch, "steps": 3} for pitch in (16, 64, 256)],
+    "inverses": [{"kind": "gray", "pitch": 4, "bits": 6, "inverted": True}],
+}
 
 
 @dataclass(frozen=True)
@@ -46,14 +61,16 @@ class Shots:
         board = share * self.sensor.saturation_e * lamp * (1 + texture * pattern / pattern.std())
         return self.frames([board * (1 + self.flicker * self.generator.standard_normal()) for _ in range(FRAMES)])
 
-    def fringes(self, steps: int = 12) -> FringeStack:
-        """Of a projector's gamma, on a board with stripes and shades."""
+    def sequence(self, name: str) -> PatternStack:
+        """Patterns of `SEQUENCES` by a projector with a gamma and a blur, each frame of another light; on stripes and shades."""
+        patterns = Patterns.model_validate(UNWRAPPED[name == "three steps"] | {"parts": SEQUENCES[name]})
         y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
         albedo = 0.55 + 0.35 * np.sin(x / 37 + y / 51) + 0.05 * np.sign(np.sin(y / 5))
-        shifts = 2 * np.pi * np.arange(steps) / steps
-        light = [(0.5 + 0.45 * np.cos(2 * np.pi * x / 19 + y / 60 + shift)) ** 1.5 + 0.1 for shift in shifts]
-        scale = 0.8 * self.sensor.saturation_e * (1 + self.flicker * self.generator.standard_normal(steps))
-        return FringeStack(self.frames([a * albedo * one for a, one in zip(scale, light, strict=True)]), shifts)
+        shown = np.concatenate([part.profiles(256) for part in patterns.parts]) ** 1.5
+        light = [np.interp(x + y / 60, np.arange(256), cv2.GaussianBlur(row[None], (0, 0), 1.0)[0]) for row in shown]
+        scale = 0.8 * self.sensor.saturation_e * (1 + self.flicker * self.generator.standard_normal(len(shown)))
+        electrons = [a * albedo * (0.9 * one + 0.1) for a, one in zip(scale, light, strict=True)]
+        return PatternStack(self.frames(electrons), patterns)
 
 
 def drawn(seed: int) -> Shots:
@@ -133,15 +150,55 @@ def test_flicker_is_no_noise(shots):
     assert naive > 2 * noise_dn(np.float32(0.6 * shots.sensor.saturation_e), shots.sensor, Exposure(EXPOSURE_S)) ** 2
 
 
-def test_fringes_alone_know_the_gain_only(shots):
-    """Without dark frames, black level and dark noise are known together, and the scene's texture hides the pixels' response."""
-    found = identify_sensor("cam1", shots.settings, fringes=[shots.fringes()])
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_patterns_alone_know_the_gain_only(shots, name):
+    """Without dark frames, black level and dark noise are known together, and the scene's texture hides the pixels' response.
+
+    Of binary fringes the odd harmonics are light, of codes a frame and its inverse together.
+    """
+    found = identify_sensor("cam1", shots.settings, sequences=[shots.sequence(name)])
     estimate = found.estimates["cam1.sensor.saturation_e"]
     assert abs(estimate.value - shots.sensor.saturation_e) < 3.5 * estimate.sigma
-    assert estimate.sigma < 0.05 * estimate.value
-    assert set(found.estimates) == {"cam1.sensor.saturation_e"}
+    assert estimate.sigma < (0.06 if name == "three steps" else 0.05) * estimate.value
+    assert set(found.estimates) == {"cam1.sensor.saturation_e", "noise_at_zero_dn2.cam1"}
     assert "dark_noise_e^2 - K black" in found.unknown["cam1.sensor.black_level_dn"]
     assert "texture" in found.unknown["cam1.sensor.prnu"]
+
+
+def variance_over(level, sensor, settings):
+    """Temporal variance of one frame of 8 bits, DN^2, at mean levels of the image, DN, by EMVA 1288's line and rounding."""
+    gain = (1.0 if settings.gain is None else settings.gain) * (256 - sensor.black_level_dn) / sensor.saturation_e
+    signal = level + 0.5 - settings.step[0] - sensor.black_level_dn
+    return gain * signal + (gain * sensor.dark_noise_e) ** 2 + 1 / 12
+
+
+@pytest.mark.parametrize("black_dn", [0.0, 2.0, 9.0])
+def test_a_sensor_known_by_its_line_has_that_noise(shots, black_dn):
+    """Black level and dark noise are assumed wrongly; the variance over level is the true one within 3 %."""
+    found = identify_sensor("cam1", shots.settings, sequences=[shots.sequence("inverses")])
+    value = found.estimates["cam1.sensor.saturation_e"].value
+    assumed = shots.sensor.model_copy(update={"saturation_e": value, "dark_noise_e": 40.0, "black_level_dn": black_dn})
+    sensors = (shots.sensor, with_noise_as_seen(assumed, "cam1", shots.settings, found), assumed)
+    expected, seen, wrong = (variance_over(np.linspace(20, 220, 6), one, shots.settings) for one in sensors)
+    np.testing.assert_allclose(seen, expected, rtol=0.03)
+    assert np.abs(wrong / expected - 1).max() > 0.05
+
+
+@pytest.mark.parametrize("name", SEQUENCES)
+def test_errors_of_frames_are_no_noise(shots, name):
+    """The variance by level is the twin's with frames of a light that differs by 5 %, within 3 % in the mean over tiles."""
+    strong = Shots(shots.sensor, shots.settings, 0.05, shots.generator)
+    stack = strong.sequence(name)
+    noise = noise_of_patterns(stack.images, stack.patterns, 8)
+    assert noise is not None
+    expected = variance_over(noise.level, shots.sensor, shots.settings)
+    assert np.average(noise.variance / expected, weights=noise.freedom) == pytest.approx(1, abs=0.03)
+
+
+def test_a_few_steps_show_no_noise(shots):
+    """Of one set of three steps, and of a code without its inverse, nothing is left that isn't light."""
+    patterns = {"projector_size": (256, 192), "unwrap": "gray", "parts": [{"kind": "fringes", "pitch": 16, "steps": 3}, CODE]}
+    assert noise_of_patterns(np.full((7, *SHAPE), 100, np.uint8), Patterns.model_validate(patterns), 8) is None
 
 
 def test_a_board_with_a_pattern_bounds_the_response(shots):

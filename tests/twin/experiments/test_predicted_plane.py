@@ -1,13 +1,16 @@
 """What is predicted of a plane is what is found on a rendered one, and depends on the rig as theory has it."""
 
+import cv2
 import numpy as np
 import pytest
 
 from recon.estimation import covariance as covariances
+from recon.geometry import rigid
 from recon.identification import calibrated_optics as identified_optics
 from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
 from recon.model.patterns import Fringes, GrayCode, Patterns
+from recon.model.rig import Pose
 from recon.optical_calibration import uncertainty
 from scenes.board_poses import Config as Poses
 from scenes.kinds import plane
@@ -23,7 +26,7 @@ def measurement(rig, **fields) -> Measurement:
     parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=8, complementary=True))
     patterns = Patterns(projector_size=rig.projector.optics.size, unwrap="gray", parts=parts)
     usual = {"plate": plane.PAPER_POSES[2], "shooting": Shooting(), "tracing": Tracing(samples=1024, room_lux=20)}
-    return Measurement(patterns, **usual | fields)
+    return Measurement(**{"patterns": patterns} | usual | fields)
 
 
 @pytest.mark.slow
@@ -90,6 +93,43 @@ def test_the_interval_is_that_of_the_measured_numbers(rig):
     now = predicted_plane.predict(rig, measurement(rig)).rms_mm
     assert predicted_plane.uncertainty(rig, measurement(rig)) == 0
     assert predicted_plane.uncertainty(one, measurement(rig)) == pytest.approx(0.025 * now, rel=0.1)
+
+
+def test_rows_count_where_they_measure(rig):
+    """With the projector turned by a right angle about its own axis, rows measure as columns did; information adds up.
+
+    Of a small plate in the middle of both views, where a turn changes hardly anything else; pinholes with square pixels.
+    """
+    optics = rig.projector.optics
+    middle = tuple((side - 1) / 2 for side in optics.size)
+    plain = optics.model_copy(update={"centre_px": middle, "distortion": (0.0,) * 5})
+    pose = rigid.from_rotation_vector((0.0, 0.0, np.pi / 2), (0.0, 0.0, 0.0)) @ plain.device_from_world.matrix()
+    turned = Pose(rotation_deg=tuple(np.rad2deg(cv2.Rodrigues(pose[:3, :3])[0].ravel())), translation_mm=tuple(pose[:3, 3]))
+    rigs = [
+        rig.model_copy(update={"projector": rig.projector.model_copy(update={"optics": one})})
+        for one in (plain, plain.model_copy(update={"device_from_world": turned}))
+    ]
+    small = plane.Config(centre_mm=plane.PAPER_POSES[2].centre_mm, size_mm=(60, 60))
+
+    def errors(one, *axes):
+        parts = tuple(Fringes(axis=axis, pitch=pitch, steps=8) for axis in axes for pitch in (12, 130, 1400))
+        patterns = Patterns(projector_size=one.projector.optics.size, unwrap="heterodyne", parts=parts)
+        return predicted_plane.predict(one, measurement(one, plate=small, patterns=patterns))
+
+    columns, rows = ([errors(one, axis) for one in rigs] for axis in ("columns", "rows"))
+    assert rows[1].rms_mm == pytest.approx(columns[0].rms_mm, rel=0.03)
+    assert columns[1].noise_mm > 1.5 * rows[1].noise_mm
+    for one, *single in zip(rigs, columns, rows, strict=True):
+        together = sum(found.noise_mm**-2 for found in single) ** -0.5
+        assert errors(one, "columns", "rows").noise_mm == pytest.approx(together, rel=0.01)
+
+
+def test_a_code_alone_is_refused(rig):
+    patterns = Patterns(
+        projector_size=rig.projector.optics.size, unwrap="gray", parts=(GrayCode(pitch=4, bits=9, inverted=True),)
+    )
+    with pytest.raises(ValueError, match="Gray code alone"):
+        predicted_plane.predict(rig, measurement(rig, patterns=patterns))
 
 
 def test_a_calibrations_errors_bend_the_plane_as_predicted(rig, rng):
