@@ -49,9 +49,10 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "masses": "twin.experiments.mass_trial",
     "seen": "twin.experiments.seen_trial",
     "identify": "twin.experiments.identify_trial",
+    "training": "twin.experiments.training_trial",
 }
 DIGITS = 6  # significant, of figures
-PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
+PACKAGES = ("recon", "scenes", "twin", "trainers")  # by whose code figures are made
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "mitsuba", "drjit", "onnxruntime")
 
 
