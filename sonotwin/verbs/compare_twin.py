@@ -2,9 +2,10 @@
 
 Reads a capture folder with a surface under patterns, and the rig and conditions that `sonotwin identify` wrote; no ground truth.
 Reconstructs the surface, takes its reflectance and the room's light from the images, renders the same patterns at the same
-exposure and bits, and decodes the result the same way. Writes into the folder `out`: report.html, with real and twin side by
-side (pictures, grey levels, noise, modulation, harmonics, edges of light, residuals), and metrics.json. Says each statistic that
-is beyond its bar, the farthest first. Takes half a minute on two cores for a megapixel.
+exposure and bits, with light from one place of the surface to another, and decodes the result the same way. Writes into the
+folder `out`: report.html, with real and twin side by side (pictures, grey levels, noise, modulation, harmonics, edges of light,
+residuals), and metrics.json. Says each statistic that is beyond its bar, the farthest first. Takes a minute or two on two cores
+for a megapixel; with tracing.bounces=1, light from the projector alone, half a minute.
 
 The rig and conditions of `sonotwin identify` are given as rig=ours/rig.yaml conditions=ours/conditions.yaml; a number of the rig
 can be tried by its name, such as rig.projector.gamma=2.2.
@@ -49,7 +50,7 @@ class Config(Part):
     """the capture that the rig was identified from, if it is another one: the page then says that this one is new to the rig"""
     camera: CameraName = "cam1"
     """whose images"""
-    tracing: Annotated[Tracing, Choice("default")]
+    tracing: Annotated[Tracing, Choice("between")]
     """of the renders; the room's light is taken from the images"""
     seed: Annotated[int, Field(ge=0)] = 1
     """of noise, of frames' errors and of rays"""

@@ -452,6 +452,29 @@ def _modulation(real: Taken, twin: Taken, contrast: tuple[Map, Map], both: Mask)
     yield Statistic("modulation_correlation", float(np.corrcoef(*maps)[0, 1]), 1, BARS.correlation)
     ratio = float(np.median(contrast[0][both]) / np.median(contrast[1][both]))
     yield Statistic("modulation_ratio", ratio, 1, BARS.modulation)
+    yield Statistic("modulation_repeated", float(np.sqrt(repeated(real, both) * repeated(twin, both))), 1, np.nan)
+
+
+def repeated(side: Taken, both: Mask) -> float:
+    """Correlation of the modulation's maps of two captures alike, of other noise and errors of frames; NaN of few or odd steps.
+
+    By that of the halves of the steps, r, without the harmonics that follow the fringes: twice the steps have 2 r / (1 + r).
+
+    Source: Spearman 1910, Brown 1910.
+    """
+    follow = harmonics(side, both)
+    for part, images in side.fringes():
+        if part.steps < MIN_STEPS_FOR_NOISE or part.steps % 2 or follow is None:
+            continue
+        values = images[:, both].astype(float)
+        _, c, s = np.tensordot(pseudo_inverse(part.shifts), values, 1)
+        phase = np.angle(c + 1j * s) + part.shifts[:, None]
+        for k, share in enumerate(follow, 2):
+            values -= np.hypot(c, s) * (share * np.exp(1j * k * phase)).real
+        halves = [np.tensordot(pseudo_inverse(part.shifts[first::2]), values[first::2], 1)[1:] for first in (0, 1)]
+        r = float(np.corrcoef(*(np.hypot(*half) for half in halves))[0, 1])
+        return 2 * r / (1 + r)
+    return np.nan
 
 
 def _harmonic(real: NDArray[np.complex128] | None, twin: NDArray[np.complex128] | None) -> Statistic:

@@ -68,7 +68,8 @@ def rerender(
         skin = skin_step.reconstruct(shots, camera)
     with watch.busy("finding its reflectance"):
         seen = seen_surface.scene_of(shots, skin, rig, camera, exposure, tracing, seed)
-    watch.say(f"scene       {np.count_nonzero(seen.inside)} px of a surface, room light {seen.room_lux:.3g} lux")
+    pixels = np.count_nonzero(seen.inside)
+    watch.say(f"scene       {pixels} px of a surface, reflectance {seen.reflectance:.2f}, room light {seen.room_lux:.3g} lux")
     shooting = Shooting(exposure_s=exposure.time_s, gain=exposure.gain, bits=exposure.bits)
     lit = tracing.model_copy(update={"room_lux": seen.room_lux})
     with watch.busy(f"rendering {shots.patterns.count} patterns"):
@@ -96,5 +97,5 @@ def read(capture: Path, rig: Rig, camera: CameraName) -> tuple[SurfaceCapture, D
 
 def _taken(images: NDArray, shots: SurfaceCapture, skin: Skin, rig: Rig, camera: CameraName) -> Taken:
     away = skin.points.points - getattr(rig, camera).optics.camera().centre.astype(np.float32)
-    light = seen_surface.seen_light(images, shots.patterns, skin.found, rig.projector.gamma)
+    light = seen_surface.seen_light(images, shots.patterns, skin.found, rig.projector.gamma, 2.0**shots.bits - 1)
     return Taken(images, shots.patterns, shots.bits, skin.found, skin.points, np.linalg.norm(away, axis=-1), light)

@@ -4,17 +4,23 @@ A pixel's images at places of a projector's image that are far inside of bright 
 and under a black image, whatever gamma and blur are. Over the light that the rig would send there, that is the reflectance;
 what the dark image has beyond the black level is the room's light. So neither fringes nor edges are used for what they test.
 
-Images show the product of flux and reflectance alone: the flux is set so that bright places have a usual one.
+A part of that light came from other places of the surface. It is in dark stripes, too, and grows with the reflectance, which is
+found by it, with as many reflections as are traced. With one, images show the product of flux and reflectance alone, and the flux
+is set so that bright places have a usual one.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
+import cv2
+import mitsuba as mi
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import binary_closing, gaussian_filter
+from scipy.optimize import minimize_scalar
 
 from recon.capture.surface_part import SurfaceCapture
 from recon.geometry import rigid
@@ -38,11 +44,16 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]  # (h, w)
 
 INSIDE_PX = 4.0  # projector px from an edge, and half a period of the fringes, from which on a place counts as inside a stripe
+UNCLIPPED, WINDOW = 0.96, (5, 5)  # of full scale: means of neighbouring px are below where none of them is clipped
 FAR_PX = 64.0  # projector px from an edge, from which on farther ones count no more
-BRIGHT = 99.5  # percentile of the reflectances, which gets
+BRIGHT = 95.0  # percentile of the reflectances, which gets
 USUAL = 0.8  # this one, of plaster or paper
 EVEN = 0.5  # reflectance of a first render
 SHARPEST = 2.0  # factor by which the blur of rendering is undone at most
+GAP_PX = 6  # camera px, half the width of gaps that are closed
+FEW = 4  # paths a pixel of light between places, which is smoothed
+ROUNDS = 2  # of that light and the reflectance
+LEAST, MOST = 0.03, 0.95  # reflectance of bright places that light between them may tell
 SLOPE = 0.02  # rad, of the surface's slopes by the points' noise after smoothing
 LEAST_PX, MOST_PX = 0.7, 4.0  # camera px, standard deviation of that smoothing
 BEHIND_MM, CLOTH_MM = 100.0, 5000.0  # distance and size of a black cloth behind it
@@ -73,6 +84,7 @@ class SeenScene:
     rig: Rig  # with the flux by which bright places have a usual reflectance
     scene: Scene
     room_lux: float
+    reflectance: float  # of bright places: as usual, unless light between places shows it
     inside: NDArray[np.bool_]  # (h, w) pixels whose surroundings are on the surface, and alike on it
 
 
@@ -103,10 +115,12 @@ def inside_of(edges: Edges, found: ProjectorMap) -> Image:
     return np.interp(x, np.arange(len(edges.inside_px)), edges.inside_px).astype(np.float32)
 
 
-def seen_light(images: NDArray, patterns: Patterns, found: ProjectorMap, gamma: float) -> SeenLight:
+def seen_light(images: NDArray, patterns: Patterns, found: ProjectorMap, gamma: float, full: float) -> SeenLight:
     """Light of pixels under a white and a black image, by the images whose stripes they lie inside of.
 
-    Of a sequence without any such the fringes tell it, by the projector's gamma and without its blur.
+    Where bright stripes are near `full`, and so clipped, the fringes' mean stands for them, which no blur changes: it is as far
+    from dark to bright as elsewhere. Of a sequence without stripes the fringes tell all, by the projector's gamma and without its
+    blur.
     """
     shape = images.shape[1:]
     sums, weights = np.zeros((2, *shape), np.float32), np.zeros((2, *shape), np.float32)
@@ -115,15 +129,22 @@ def seen_light(images: NDArray, patterns: Patterns, found: ProjectorMap, gamma: 
         if edges.axis not in axes:
             continue
         inside = inside_of(edges, found)
+        unclipped = cv2.blur(images[edges.number].astype(np.float32), WINDOW) < UNCLIPPED * full
         least = INSIDE_PX if np.isinf(edges.pitch) else max(INSIDE_PX, edges.pitch / 2)
         weight = np.where(np.abs(inside) >= least, np.minimum(np.abs(inside), FAR_PX), 0)
-        for k, side in enumerate((inside < 0, inside > 0)):
+        for k, side in enumerate((inside < 0, (inside > 0) & unclipped)):
             weights[k] += weight * side
             sums[k] += weight * side * images[edges.number]
     if not weights.any():
         return _by_fringes(images, patterns, found, gamma)
     with np.errstate(invalid="ignore"):
         dark, bright = sums / np.where(weights > 0, weights, np.float32(np.nan))
+    for part, place in patterns.slices():
+        if not isinstance(part, Fringes) or not (clipped := np.isnan(bright) & np.isfinite(dark)).any():
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            beyond = np.where(images[place].max(axis=0) < full, images[place].mean(axis=0, dtype=np.float32) - dark, np.nan)
+            bright[clipped] = (dark + beyond / np.nanmedian(beyond / (bright - dark)))[clipped]
     return SeenLight(bright, dark)
 
 
@@ -166,45 +187,95 @@ def scene_of(
     points, inside = smoothed(skin.points, device.optics.camera())
     mesh = surface_mesh.mesh(PointMap(points, skin.points.sigma), device.optics.camera())
     u, v = np.rint(device.optics.camera().project(mesh.vertices)).astype(int).T
-    light = seen_light(shots.images, shots.patterns, skin.found, rig.projector.gamma)
+    light = seen_light(shots.images, shots.patterns, skin.found, rig.projector.gamma, 2.0**shots.bits - 1)
     optics = camera_optics(rig, camera)
     per_radiance = (
         electrons_per_radiance(device, rig.projector.wavelength_nm)
         * exposure.time_s
         * number_per_electron(device.sensor, exposure)
     )
-    white = (light.bright - light.dark) / np.float32(per_radiance)
-    unlit = tracing.model_copy(update={"room_lux": 0.0, "bounces": 1})
+    white = light.bright - light.dark
+    projector, straight = ProjectorOptics.of(rig.projector), tracing.model_copy(update={"room_lux": 0.0, "bounces": 1})
+
+    def world_of(albedo: Image) -> mi.Scene:
+        """The surface alone."""
+        return build_world(Scene("seen", (Thing("surface", mesh, Material(EVEN), albedo[v, u]),)))
 
     def lit(albedo: Image) -> Image:
-        """Radiance : (h, w) under a white image, less that under a black one."""
-        thing = Thing("surface", mesh, Material(EVEN), albedo[v, u])
+        """Light : (h, w) DN under a white image, less that under a black one, straight from the projector."""
         size = rig.projector.optics.size
         all_on = Light.of_profiles(size, [("columns", True, np.ones(size[0], np.float32))], rig.projector)
-        shown = render(build_world(Scene("seen", (thing,))), optics, ProjectorOptics.of(rig.projector), all_on, unlit, seed)[0]
-        return shown * np.float32(1 - 1 / rig.projector.contrast)
+        shown = render(world_of(albedo), optics, projector, all_on, straight, seed)[0]
+        return shown * np.float32((1 - 1 / rig.projector.contrast) * per_radiance)
+
+    def again(albedo: Image) -> list[SeenLight]:
+        """Light that comes back from the surface once more, twice more, and so on, DN."""
+        world, shown = world_of(albedo), Light.of(shots.patterns, rig.projector)
+        few = [straight.model_copy(update={"samples": FEW, "bounces": most + 1}) for most in range(tracing.bounces)]
+        sums = [render(world, optics, projector, shown, one, seed) for one in few]  # all of the same paths
+        orders = [(longer - shorter) * np.float32(per_radiance) for shorter, longer in pairwise(sums)]
+        return [seen_light(images, shots.patterns, skin.found, rig.projector.gamma, np.inf) for images in orders]
 
     with np.errstate(divide="ignore", invalid="ignore"):
         albedo = EVEN * white / lit(np.full(white.shape, np.float32(EVEN)))
     known = np.isfinite(albedo) & (albedo > 0) & np.isfinite(points[..., 0])
-    scale = float(np.percentile(albedo[known], BRIGHT)) / USUAL
+    usable = known & inside if (known & inside).any() else known  # at borders and steps reflectances are wrong
+    scale = float(np.percentile(albedo[usable], BRIGHT)) / USUAL
     albedo = np.clip(_filled(np.where(known, albedo / np.float32(scale), np.float32(np.nan))), 0, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         sharper = np.nan_to_num(white / scale / lit(albedo), nan=1.0, posinf=1.0)
     albedo = np.clip(albedo * np.clip(sharper, 1 / SHARPEST, SHARPEST), 0, 1)
-    projector = rig.projector.model_copy(update={"radiant_flux_w": rig.projector.radiant_flux_w * scale})
-    bright = rig.model_copy(update={"projector": projector})
-    beyond = light.dark - _black_dn(bright, camera, exposure) - white * np.float32(per_radiance / rig.projector.contrast)
-    share = beyond[known] / (albedo * optics.transmission * np.float32(per_radiance))[known]
-    room = max(float(np.nanmedian(share)), 0.0)
+    share, direct = optics.transmission * np.float32(per_radiance), white
+    beyond = light.dark - _black_dn(rig, camera, exposure) - white / np.float32(rig.projector.contrast)
+    between = np.float32(0)
+    for _ in range(ROUNDS if tracing.bounces > 1 else 0):
+        orders = [SeenLight(*(_but_for(albedo, np.float32(scale) * side) for side in one)) for one in again(albedo)]
+        bright = float(np.percentile(albedo[usable], BRIGHT))
+        times = _reflectance(beyond, albedo * share, [one.dark for one in orders], usable, (LEAST / bright, MOST / bright))
+        more, dark = (sum(times**k * one[side] for k, one in enumerate(orders, 1)) for side in range(2))
+        left = np.nan_to_num(white / (direct + more - dark), nan=1.0, posinf=1.0)
+        direct, between, scale = direct * left, dark * left, scale / times
+        albedo = np.clip(albedo * left * times, 0, 1).astype(np.float32)
+    device = rig.projector.model_copy(update={"radiant_flux_w": rig.projector.radiant_flux_w * scale})
+    room = max(float(np.nanmedian(((beyond - between) / (albedo * share))[known])), 0.0)
     thing = Thing("surface", mesh, Material(EVEN), albedo[v, u])
-    return SeenScene(bright, Scene("seen", (thing, _backdrop(mesh))), room * LUMENS_PER_WATT * np.pi * 1e6, inside & known)
+    return SeenScene(
+        rig.model_copy(update={"projector": device}),
+        Scene("seen", (thing, _backdrop(mesh))),
+        room * LUMENS_PER_WATT * np.pi * 1e6,
+        float(np.percentile(albedo[usable], BRIGHT)),
+        inside & known,
+    )
+
+
+def _but_for(base: Image, light: Image) -> Image:
+    """Light : (h, w) that is smooth but for what it has in common with a base, without its noise; NaN where that isn't light."""
+    known = np.isfinite(light) & (base > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sums = gaussian_filter(np.where(known, light / base, 0), MOST_PX, mode="constant")
+        share = sums / gaussian_filter(known.astype(np.float32), MOST_PX, mode="constant")
+    return np.where(base > 0, base * share, np.float32(np.nan))
+
+
+def _reflectance(beyond: Image, even: Image, dark: list[Image], known: NDArray[np.bool_], bounds: tuple[float, float]) -> float:
+    """Factor of the reflectance by which light between places explains what is in dark stripes, beside an even room's.
+
+    Light that comes back n times goes with its n-th power; the flux goes down as the reflectance goes up.
+    """
+    told = known & np.isfinite(beyond) & np.isfinite(dark).all(axis=0)
+
+    def unexplained(times: float) -> float:
+        rest = beyond[told] - sum(times**k * one[told] for k, one in enumerate(dark, 1))
+        return float(np.abs(rest - max(np.median(rest / even[told]), 0.0) * even[told]).mean())
+
+    return float(minimize_scalar(unexplained, bounds=bounds, method="bounded").x)
 
 
 def smoothed(points: PointMap, camera: Camera) -> tuple[Image, NDArray[np.bool_]]:
     """Points : (h, w, 3) mm, moved along their rays to a weighted mean of their neighbours; and those beside no step.
 
-    As far as it takes for slopes that noise leaves at some hundredths: light on a rough surface would have shadows.
+    As far as it takes for slopes that noise leaves at some hundredths: light on a rough surface would have shadows. Narrow gaps,
+    as of creases in the projector's shadow, are closed: light would be lost in them.
     """
     away = points.points.astype(float) - camera.centre
     distance = np.linalg.norm(away, axis=-1)
@@ -218,6 +289,8 @@ def smoothed(points: PointMap, camera: Camera) -> tuple[Image, NDArray[np.bool_]
         mean = gaussian_filter(np.where(known, distance, 0), width, mode="constant") / share
         moved = away * (mean / distance)[..., None] + camera.centre
     moved[~known] = np.nan
+    gaps = binary_closing(known, iterations=GAP_PX) & ~known
+    moved[gaps] = camera.centre + camera.pixel_rays()[gaps] * _filled(np.where(known, mean, np.nan))[gaps, None]
     whole = share > 0.99
     steady = np.abs(mean - distance) < SHIFTED * np.maximum(points.sigma, noise * step) + step / 2
     return moved.astype(np.float32), known & whole & np.nan_to_num(steady).astype(bool)

@@ -24,6 +24,7 @@ NAMES = {
     "temporal_spectrum": "temporal power of noise and flicker",
     "spatial_spectrum": "spatial spectrum of noise, in the band that is farthest off",
     "modulation_correlation": "correlation of the maps of modulation",
+    "modulation_repeated": "that of two captures alike, by halves of their steps",
     "modulation_ratio": "modulation of the fringes over the light",
     "harmonics": "harmonics of the fringes, the farthest off, of the modulation",
     "edge_width": "width of edges of light, 25 to 75 %",
@@ -72,8 +73,8 @@ FOOTER = "Made by sonotwin without any ground truth. This file is complete: it f
 LIMITS = (
     "The surface’s shape, its reflectance, pixel by pixel from the light under bright and dark stripes, and the room’s light are "
     "taken from this capture, so grey levels there agree by themselves. Fringes, edges, noise and what follows from them are "
-    "the rig’s. Frames’ errors are drawn anew. Light from one place of the surface to another, and what stands around it, isn’t "
-    "rendered unless tracing.bounces says so."
+    "the rig’s. Frames’ errors are drawn anew. Light from one place of the surface to another goes as many ways as "
+    "tracing.bounces says; what stands around it isn’t rendered."
 )
 
 
@@ -152,7 +153,9 @@ def _rings_off(one: Statistic, real: Taken, found: Likeness) -> str:
 
 
 def _correlation_off(one: Statistic, real: Taken, found: Likeness) -> str:
-    return f"Modulation: its map and the twin’s have a correlation of {one.value:.3f}: it differs from place to place."
+    alike = found["modulation_repeated"].value
+    but = f"; two captures alike would have {alike:.3f}" if np.isfinite(alike) else ""
+    return f"Modulation: its map and the twin’s have a correlation of {one.value:.3f}: it differs from place to place{but}."
 
 
 def _modulation_off(one: Statistic, real: Taken, found: Likeness) -> str:

@@ -50,7 +50,7 @@ def taken(images: np.ndarray, gamma: float = 1.0) -> Taken:
     sigma = np.full(SHAPE, 0.05, np.float32)
     points = PointMap(np.zeros((*SHAPE, 3), np.float32), sigma)
     distance = np.float32(650 + np.random.default_rng(3).normal(0, 0.05, SHAPE))
-    return Taken(numbers, SEQUENCE, 8, found, points, distance, seen_light(numbers, SEQUENCE, found, gamma))
+    return Taken(numbers, SEQUENCE, 8, found, points, distance, seen_light(numbers, SEQUENCE, found, gamma, 255.0))
 
 
 def noisy(images: np.ndarray, rng: np.random.Generator, gain: float = 0.04) -> np.ndarray:
@@ -69,6 +69,26 @@ def test_what_is_alike_is_explained(rng):
     assert not found.off, found.off
     assert next(likeness_report.unexplained(real, found)).startswith("Nothing: all 9 statistics")
     assert found["modulation_correlation"].value > 0.99 and found["harmonics"].value < 0.002
+
+
+@pytest.mark.parametrize("third", [0.0, 0.06])
+def test_halves_of_the_steps_tell_how_alike_two_captures_are(rng, third):
+    """Maps of modulation of two draws have the correlation that each draw's own halves predict, within 0.01.
+
+    With errors of frames of 2 %, and noise: they leave 0.8 to 0.95 of it. Third harmonics, which four steps take for the first,
+    fall out.
+    """
+    fringes = SEQUENCE.parts[0]
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    phase = 2 * np.pi * (60.3 + 2.37 * u + 0.01 * v - fringes.zero(1024)) / fringes.pitch + fringes.shifts[:, None, None]
+    draws = []
+    for _ in range(2):
+        images, albedo, _ = light_of(gains=1 + 0.02 * rng.standard_normal(SEQUENCE.count))
+        images[:STEPS] += third * albedo / 2 * np.cos(3 * phase)
+        draws.append(taken(noisy(images, rng, 0.6)))
+    found = compared(*draws)
+    assert 0.8 < found["modulation_correlation"].value < 0.95
+    assert found["modulation_repeated"].value == pytest.approx(found["modulation_correlation"].value, abs=0.01)
 
 
 @pytest.mark.parametrize("gain", [0.03, 0.052])

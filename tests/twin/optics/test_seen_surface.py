@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from recon.capture.surface_part import SurfaceCapture
+from recon.geometry import rigid
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.session import skin_step
+from recon.structured_light.decode import decode
 from recon.structured_light.triangulate import PointMap
+from scenes import solid_meshes
 from scenes.catalogue import build_scene
+from scenes.scene_types import Material, Scene, Thing
 from tests.twin.small_rigs import cropped
 from twin.optics import seen_surface
 from twin.optics.light_transport import Tracing
@@ -42,6 +46,26 @@ def test_noise_of_a_plane_is_smoothed_to_small_slopes(rig, rng):
     assert abs(depth[inside].mean() - 650) < 0.02 and np.diff(noisy[..., 2], axis=1).std() / step > 0.5
 
 
+def test_light_of_clipped_stripes_is_that_of_the_fringes():
+    """Where bright stripes are clipped, white is what the fringes' mean says of it, to a percent; elsewhere it stays.
+
+    Bright stripes of 100 to 330 DN on a plane that sees two projector px a camera px, dark ones of 12 DN, and fringes that blur
+    has left 0.45 of.
+    """
+    parts = (Fringes(pitch=16, steps=8), GrayCode(pitch=16, bits=6, complementary=True))
+    patterns = Patterns(projector_size=(1024, 64), unwrap="gray", parts=parts)
+    x = np.broadcast_to(60.3 + 2.37 * np.arange(320), (200, 320))
+    albedo = np.broadcast_to(np.linspace(90, 320, 200)[:, None], x.shape)
+    place = np.rint(x).astype(int)
+    shown = [profile if binary else 0.5 + 0.45 * (profile - 0.5) for _, binary, profile in patterns.profiles()]
+    images = np.array([12 + albedo * profile[place] for profile in shown])
+    found = decode(np.clip(images, 0, 255).astype(np.uint8), patterns)
+    light = seen_surface.seen_light(np.rint(np.clip(images, 0, 255)), patterns, found, 1.0, 255.0)
+    known = np.isfinite(light.bright)
+    assert known.mean() > 0.9 and known[-40:].mean() > 0.9
+    np.testing.assert_allclose(light.bright[known], 12 + albedo[known], rtol=0.01)
+
+
 @pytest.mark.slow
 def test_reflectance_and_room_light_are_those_that_were_rendered(rig):
     """A sphere of 0.6 before a plane of 0.3, but for a factor that goes into the flux; and so the room's light over the flux."""
@@ -59,3 +83,27 @@ def test_reflectance_and_room_light_are_those_that_were_rendered(rig):
     assert ratio == pytest.approx(2, rel=0.02)
     assert np.median(surface.albedo[near]) * scale == pytest.approx(0.6, rel=0.02)
     assert seen.room_lux / scale == pytest.approx(60, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bounces", "reflectance"), [(3, 0.85), (1, 0.0)])
+def test_light_in_a_hollow_tells_the_reflectance(rig, bounces, reflectance):
+    """A groove of 100 degrees and 0.85: found to 0.05, and as even as it is; where no light was reflected twice, it is black.
+
+    What two captures of noise leave is 0.03: the bound of 0.95 of its lightest twentieth.
+    """
+    small = rig.model_copy(update={"cam1": cropped(rig.cam1, (240, 192))})
+    points, triangles = solid_meshes.grid((36.0, 28.0), (180, 140))
+    deep = solid_meshes.slab(points, triangles, 30.0, -np.abs(points[:, 0]) / np.tan(np.radians(50)))
+    groove = Thing("groove", solid_meshes.moved(deep, rigid.transform(np.eye(3), (0, 0, 665))), Material(0.85), smooth=False)
+    parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=7, complementary=True))
+    patterns = Patterns(projector_size=small.projector.optics.size, unwrap="gray", parts=parts)
+    view = shoot(small, Scene("groove", (groove,)), patterns, "cam1", Tracing(samples=32, bounces=bounces), Shooting(), 3)
+    shots = SurfaceCapture(view.images, patterns, 8, calibration_of(small), "a groove")
+    again = Tracing(samples=16, bounces=3)
+    seen = seen_surface.scene_of(shots, skin_step.reconstruct(shots), small, "cam1", view.exposure, again, 4)
+    surface = seen.scene.things[0]
+    aside = np.abs(surface.mesh.vertices[:, 0])
+    assert np.median(surface.albedo) == pytest.approx(reflectance, abs=0.05)
+    ratio = np.median(surface.albedo[aside < 6]) / np.median(surface.albedo[aside > 11])
+    assert ratio == pytest.approx(1, abs=0.03)
