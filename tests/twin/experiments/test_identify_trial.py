@@ -72,6 +72,7 @@ def test_the_sheet_holds_nothing_of_what_is_to_be_identified(rig):
 def test_a_drawn_rig_is_identified_from_its_images(rig, tmp_path, monkeypatch):
     """Of some 60 numbers at least 85 % within their 95 % intervals, all within 6 sigma; the focal lengths to 0.1 %."""
     monkeypatch.setattr(identify_trial, "POSES", 8)
+    monkeypatch.setattr(identify_trial, "FRINGES_TRACING", dict.fromkeys(identify_trial.CAMERAS, identify_trial.TRACING))
     seed = 51
     drawn, conditions = drawn_rig.draw(rig, seed)
     array = drawn_rig.draw_scanner(np.random.default_rng([seed, 61]))
