@@ -279,4 +279,6 @@ def judge(found: Findings, truth: Mapping[str, float]) -> Metrics:
     return figures | {f"{name.replace('.', '_')}_over_sigma": float(value) for name, value in off.items()}
 
 
-EXPERIMENT = Experiment(("rig", "poses"), measure, {"held_share": ""}, counts=("measured", "held", "ranked", "ranked_by_sheet"))
+SHOWN = ("held_share", "optics_error_over_sigma", *(f"{name}_predicted_over_found" for name in SETTINGS))
+COUNTS = ("measured", "held", "ranked", "ranked_by_sheet")
+EXPERIMENT = Experiment(("rig", "poses"), measure, dict.fromkeys(SHOWN, ""), counts=COUNTS)
