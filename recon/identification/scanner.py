@@ -38,6 +38,7 @@ Images = NDArray[np.uint8]
 NO_CARRIER = "detected images hold no carrier: read off the probe"
 USUAL_BAND = 0.5  # of an echo over the frequency, where it isn't known
 NO_TISSUE = "no B-scans of even tissue"
+WITHIN = np.array([-1, 1]) / np.sqrt(12)  # of a band's depth, from its middle: places whose mean is the band's (Gauss's, two)
 REACH_MM = 2.0  # across the plane, within which B-scans may show the same grains
 
 
@@ -68,13 +69,13 @@ class Settings:
     """Bands of the analysis, and what is assumed of scanners."""
 
     face_mm: float = 4.0  # left out: the ringing of the face
-    near_mm: float = 7.0  # from which on a band's beam is that of its middle
+    near_mm: float = 7.0  # from which on a band's beam is that of two depths in it
     level_band_mm: float = 1.5  # over which the mean grey hardly changes
     grain_band_mm: float = 3.0  # over which grains are alike
     reach_mm: float = 1.5  # longest lag
     spread: float = 0.01  # relative error of a dB: speckle of few scatterers a cell has 2 % more or less variance
     level_db: float = 0.4  # error of a tissue's level: of what the gain makes up for besides attenuation
-    beam: float = 0.01  # relative error of apertures by the closed forms: one depth for a band, Fresnel's approximation
+    beam: float = 0.01  # relative error of apertures by the closed forms: two depths for a band, Fresnel's approximation
     interpolated: tuple[float, float] = (1 / 6, 0.096)  # share of a neighbour's echo: evenly from none to twice a linear one's
     seen: float = 0.4  # of what was assumed beforehand: parameters known no better than by this are unknown
     relative: float = 0.3  # worse than by this, they are unknown
@@ -234,7 +235,12 @@ def along(
     deep = grains.depth_mm >= settings.near_mm
     if deep.sum() < 3:
         return found, None
-    far = grains._replace(depth_mm=grains.depth_mm[deep], along=grains.along[deep], along_without=grains.along_without[:, deep])
+    far = grains._replace(
+        depth_mm=grains.depth_mm[deep],
+        black=grains.black[deep],
+        along=grains.along[deep],
+        along_without=grains.along_without[:, deep],
+    )
     beam, focus = _beam(far, sx, known[deep], sheet, settings, source)
     return found | beam, focus
 
@@ -250,14 +256,15 @@ def _band(grains: Grains, row_mm: float, end_mm: float, share: Array, sheet: She
             sound_beam.interpolated(partial(sound_beam.alike_deep, own, sheet.assumed_speed), lags, row_mm / 2, told[0])
             for own in band
         ]
-        return share[:, None] * np.array(alike)
+        return share[:, None] * np.array(alike)[None]
 
     f = sheet.frequency_mhz
     prior = np.array([[np.log(0.6 * f.value), 0.6], [np.log(0.5 * f.value), 0.6]])
     given = np.array([settings.interpolated])
     lags_seen = _informative(grains.deep)
     lags = lags[lags_seen]
-    fit = _adjusted(correlations, grains.deep[:, lags_seen], grains.deep_without[..., lags_seen], prior, given, [prior[:, 0]])
+    seen = grains.deep[:, lags_seen], grains.deep_without[..., lags_seen], grains.black
+    fit = _adjusted(correlations, *seen, prior, given, [prior[:, 0]])
     estimates, unknown = {}, {}
     for number in (0, 1):
         name = f"ultrasound.bandwidth.{number}"
@@ -284,7 +291,8 @@ def _beam(
         receive, transmit, focus, widest = np.exp(theta)
         beam = Along(1e-3 * sheet.assumed_speed / np.exp(told[0]), focus, transmit, receive, widest)
         alike = [
-            sound_beam.interpolated(sound_beam.alike_along(beam, depth), lags, column_mm, told[1]) for depth in grains.depth_mm
+            [sound_beam.interpolated(sound_beam.alike_along(beam, depth), lags, column_mm, told[1]) for depth in places]
+            for places in grains.depth_mm + WITHIN[:, None] * settings.grain_band_mm
         ]
         return share[:, None] * np.array(alike)
 
@@ -295,7 +303,8 @@ def _beam(
         for receive, transmit in ((1.8, 3.5), (2.6, 2.4)):
             starts.append(prior[:, 0].copy())
             starts[-1][:3] = np.log([receive, transmit, focus])
-    fit = _adjusted(correlations, grains.along[:, chosen], grains.along_without[..., chosen], prior, given, starts)
+    seen = grains.along[:, chosen], grains.along_without[..., chosen], grains.black
+    fit = _adjusted(correlations, *seen, prior, given, starts)
     estimates, unknown = {}, {}
     for number, name in enumerate(names):
         value, sigma = float(np.exp(fit.values[number])), fit.sigma(number)
@@ -318,16 +327,18 @@ def _adjusted(
     correlations: Callable[[Array, Array], Array],
     grey: Array,
     without: Array,
+    black: Array,
     prior: Array,
     given: Array,
     starts: list[Array],
     by_band: bool = False,
 ) -> _Adjusted:
-    """Fit field correlations : (b, m) of parameters : (p,) and of what is given : (q,) to grey ones.
+    """Fit field correlations : (d, b, m), at d places of a band, of parameters : (p,) and of what is given : (q,) to grey ones.
 
     Parameters
     ----------
     without : (k, b, m), grey correlations without a part each, whose scatter is the noise
+    black : (b,) share of black pixels
     prior : (p, 2) mean and standard deviation of what was assumed of the parameters
     given : (q, 2) the same of what isn't fitted: small errors of the model would tell more of it than a label does
     by_band : whether parts of a band are independent of those of others, or go with them
@@ -339,7 +350,8 @@ def _adjusted(
     whiten = np.linalg.inv(np.linalg.cholesky(shared))
 
     def residuals(theta: Array, told: Array = told) -> Array:
-        rest = (speckle.grey_correlation(correlations(theta, told)) - grey) @ whiten.T
+        alike = [speckle.grey_correlation(places, black) for places in correlations(theta, told)]
+        rest = (np.mean(alike, axis=0) - grey) @ whiten.T
         return np.concatenate([rest.ravel(), (theta - prior[:, 0]) / prior[:, 1]])
 
     follow = partial(least_squares, residuals, method="trf", x_scale=prior[:, 1], ftol=1e-6)
@@ -538,14 +550,17 @@ def across(
 
     def correlations(theta: Array, told: Array) -> Array:
         slab = Across(1e-3 * sheet.assumed_speed / float(np.exp(told[0])), *np.exp(theta))
-        return known[:, None] * np.array(
-            [sound_beam.alike_across(slab, each, steps + told[1:] @ shifts, own) for each, own in zip(depth, band, strict=True)]
-        )
+        alike = [
+            [sound_beam.alike_across(slab, each, steps + told[1:] @ shifts, own) for each, own in zip(places, band, strict=True)]
+            for places in depth + WITHIN[:, None] * settings.grain_band_mm
+        ]
+        return known[:, None] * np.array(alike)
 
     prior = np.array([LIKELY[name] for name in names])
     given = np.array([(np.log(f.value), f.sigma / f.value), *[(0.0, 1.0)] * len(shifts)])
     starts = [np.log([height, focus]) for height in (3.3, 4.6, 6.5) for focus in (12.0, 16.0, 21.0, 28.0)]
-    fit = _adjusted(correlations, grey[:, near], without[..., near], prior, given, starts, by_band=True)
+    black = np.array([(images[:, band] == 0).mean() for band in rows])
+    fit = _adjusted(correlations, grey[:, near], without[..., near], black, prior, given, starts, by_band=True)
     estimates, unknown = {}, {}
     for number, name in enumerate(names):
         value, sigma = float(np.exp(fit.values[number])), fit.sigma(number)

@@ -136,6 +136,15 @@ def identify_sensor(
     return found
 
 
+def without_light(black_level: Estimate, settings: ImageSettings) -> Estimate:
+    """Mean, DN, that an image shows of a pixel without light, by the black level in 8-bit DN.
+
+    Bits that an image leaves out are cut off, not rounded: 0.38 and 0.47 DN less in images of 8 bits by ADCs of 10 and 12.
+    """
+    deeper = 2.0 ** (settings.bits - 8)
+    return Estimate(deeper * black_level.value - (0.5 - settings.step[0]), deeper * black_level.sigma, black_level.source)
+
+
 def with_noise_as_seen(sensor: Sensor, camera: str, settings: ImageSettings, found: Findings) -> Sensor:
     """A sensor whose dark noise and black level are known together only, so that its noise is the one that was seen.
 

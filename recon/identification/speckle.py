@@ -5,14 +5,16 @@ the logarithms of the powers have the covariance `Li2(rho^2)`, Spence's dilogari
 show |rho| whatever their scale, and grains' sizes need no greys a dB, as long as the map is linear in dB and nothing clips.
 
 Source: the joint density of two such powers (Goodman, Speckle Phenomena in Optics, section 3.3), whose Laguerre series gives a
-covariance of the logarithms of `sum rho^(2 n) / n^2`.
+covariance of the logarithms of `sum rho^(2 n) / n^2`. Powers that are shown as black cut off the logarithm's long tail, which is
+of small spots: 0.5 % of black pixels raise correlations of 0.7 to 0.9 by 0.014, eight standard deviations of a dozen B-scans.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import spence
+from scipy.special import expn, spence
 
 Array = NDArray[np.float64]
 Images = NDArray[np.uint8]
@@ -21,6 +23,8 @@ WHOLE = np.pi**2 / 6  # variance of the logarithm of an exponentially distribute
 SPREAD_DB = 10 / np.log(10) * np.sqrt(WHOLE)  # 5.57 dB
 STRIP_MM = 4.0  # width of the parts of an image that count as independent, at least
 SAME_PLACE = 0.15  # correlation of two B-scans' grains, from which on they show the same tissue
+ALIKE = np.linspace(0, 1, 2001)  # of fields, at which correlations of grey levels are tabulated
+TERMS = 512  # of the Laguerre series; rho^1024 is under 1e-4 up to 0.991
 CLIPPED = 0.02  # share of black and white pixels in a band, above which its grains are not measured
 
 
@@ -29,6 +33,7 @@ class Grains(NamedTuple):
 
     depth_mm: Array  # (b,) middles of the bands
     rows: list[slice]  # of each band
+    black: Array  # (b,) share of black pixels
     deep: Array  # (b, m) at lags of 1 .. m rows
     along: Array  # (b, n) at lags of 1 .. n columns
     deep_without: Array  # (k, b, m)
@@ -36,15 +41,44 @@ class Grains(NamedTuple):
     shape: Array  # (b,) skewness: -1.14 of fully developed speckle
 
 
-def grey_correlation(alike: Array) -> Array:
-    """Correlation of grey levels of places whose fields correlate by |rho|."""
-    return spence(1 - np.clip(alike, 0, 1) ** 2) / WHOLE
+def grey_correlation(alike: Array, black: Array | float = 0.0) -> Array:
+    """Correlation of grey levels of places whose fields correlate by |rho|.
+
+    black : share of pixels that are shown as black; (b,) of the rows of alike : (b, m)
+    """
+    if not np.any(black):
+        return spence(1 - np.clip(alike, 0, 1) ** 2) / WHOLE
+    rows = np.atleast_2d(alike)
+    tables = [_with_black(float(share)) for share in np.broadcast_to(black, len(rows))]
+    return np.reshape([np.interp(row, ALIKE, table) for row, table in zip(rows, tables, strict=True)], np.shape(alike))
+
+
+@lru_cache(maxsize=256)
+def _with_black(share: float) -> Array:
+    """Correlation of grey levels at `ALIKE`, with a share of black pixels.
+
+    With L the Laguerre polynomials, the greys `ln max(p, c)` of powers p, of mean 1, have the coefficients
+    `-1/n + int_0^c (L_(n-1)(p) - L_n(p)) exp(-p) / p dp`.
+    """
+    if share == 0:
+        return grey_correlation(ALIKE)
+    nodes, weights = np.polynomial.legendre.leggauss(64)
+    end = -np.log1p(-share)
+    p, part = end * (nodes + 1) / 2, end * weights / 2
+    before, now, found = np.ones_like(p), 1 - p, np.empty(TERMS)
+    for n in range(1, TERMS + 1):
+        found[n - 1] = -1 / n + ((before - now) * np.exp(-p) / p) @ part
+        before, now = now, ((2 * n + 1 - p) * now - n * before) / (n + 1)
+    seen = np.log(end) + (np.log(50.0) - np.log(end)) * (nodes + 1) / 2  # logarithms of powers that aren't black
+    above = (np.log(50.0) - np.log(end)) / 2 * ((seen - np.log(end)) ** 2 * np.exp(seen - np.exp(seen))) @ weights
+    variance = above - float(expn(1, end)) ** 2
+    powers = ALIKE[:, None] ** (2 * np.arange(1, TERMS + 1))
+    return powers @ found**2 / variance
 
 
 def field_correlation(grey: Array) -> Array:
-    """The inverse: |rho| by the correlation of grey levels; 0 of none or less."""
-    alike = np.linspace(0, 1, 2001)
-    return np.interp(grey, grey_correlation(alike), alike)
+    """The inverse of `grey_correlation` without black: |rho| by the correlation of grey levels; 0 of none or less."""
+    return np.interp(grey, grey_correlation(ALIKE), ALIKE)
 
 
 def bands(height: int, row_mm: float, first_mm: float, band_mm: float) -> list[slice]:
@@ -86,7 +120,7 @@ def measure(
     sx, sy = mm_per_px
     lags = max(int(reach_mm / sy), 2), max(int(reach_mm / sx), 2)
     count = part.max() + 1
-    kept, deep, along, shape = [], [], [], []
+    kept, black, deep, along, shape = [], [], [], [], []
     for band in rows:
         greys = images[:, band]
         if ((greys == 0) | (greys == 255)).mean() > CLIPPED:
@@ -94,6 +128,7 @@ def measure(
         grains = _detrended(greys)
         variance = _by_part(grains**2, part, count)
         kept.append(band)
+        black.append((greys == 0).mean())
         deep.append([variance] + [_by_part(grains[:, k:] * grains[:, :-k], part, count) for k in range(1, lags[0] + 1)])
         along.append(
             [variance] + [_by_part(grains[..., k:] * grains[..., :-k], part[:, k:], count) for k in range(1, lags[1] + 1)]
@@ -102,9 +137,9 @@ def measure(
     depth = np.array([sy * (band.start + band.stop - 1) / 2 for band in kept])
     if not kept:
         none, left_out = np.zeros((0, 1)), np.zeros((count, 0, 1))
-        return Grains(depth, kept, none, none, left_out, left_out, np.zeros(0))
+        return Grains(depth, kept, np.zeros(0), none, none, left_out, left_out, np.zeros(0))
     (deep_whole, deep_without), (along_whole, along_without) = (_ratios(np.array(sums)) for sums in (deep, along))
-    return Grains(depth, kept, deep_whole, along_whole, deep_without, along_without, np.array(shape))
+    return Grains(depth, kept, np.array(black), deep_whole, along_whole, deep_without, along_without, np.array(shape))
 
 
 def lags(steps_mm: Array) -> tuple[Array, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

@@ -206,7 +206,7 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
             found |= _sensor(camera, settings, own, list(_stacks(camera, shots.get(camera), board)))
     if board is not None:
         with watch.busy("measuring the lenses"):
-            found |= _lenses(*board, rig, found)
+            found |= _lenses(*board, settings, rig, found)
     if CAMERAS[0] in shots:
         with watch.busy("measuring the projector"):
             found |= _projector(CAMERAS[0], shots[CAMERAS[0]], rig, found, frames[CAMERAS[0]].room)
@@ -307,7 +307,7 @@ def _gain(settings: Settings, device: Device) -> float | None:
     return device.gain if settings.gain is None else settings.gain
 
 
-def _lenses(captured: BoardCapture, optics: Result, rig: Rig, known: Findings) -> Findings:
+def _lenses(captured: BoardCapture, optics: Result, settings: Settings, rig: Rig, known: Findings) -> Findings:
     """Blur and light of both cameras by the board's discs and its white."""
     found, calibration = Findings(), optics.adjustment.calibration
     places = dict(zip(optics.observations.poses, optics.adjustment.poses, strict=True))
@@ -341,17 +341,17 @@ def _lenses(captured: BoardCapture, optics: Result, rig: Rig, known: Findings) -
         found |= lenses.find_lens(lenses.joined(parts), camera, focal_length=nominal)
         if whites[camera]:
             light = vignetting.find_vignetting(
-                vignetting.joined(whites[camera]), camera, black=_black(camera, captured, rig, known)
+                vignetting.joined(whites[camera]), camera, black=_black(camera, captured, settings, rig, known)
             )
             found |= replace(light, estimates=light.estimates | _agreed(found.estimates, light.estimates))
     return found
 
 
-def _black(camera: str, captured: BoardCapture, rig: Rig, known: Findings) -> Estimate:
+def _black(camera: str, captured: BoardCapture, settings: Settings, rig: Rig, known: Findings) -> Estimate:
     """A pixel without light, in DN of the board's images."""
     assumed = Estimate(getattr(rig, camera).sensor.black_level_dn, BLACK_SIGMA_DN, "assumed")
-    one, deeper = _known(f"{camera}.sensor.black_level_dn", rig, known) or assumed, 2.0 ** (captured.devices[camera].bits - 8)
-    return Estimate(deeper * one.value, deeper * one.sigma, one.source)
+    level = _known(f"{camera}.sensor.black_level_dn", rig, known) or assumed
+    return sensors.without_light(level, ImageSettings(captured.devices[camera].bits, adc_bits=settings.adc_bits))
 
 
 def _known(name: str, rig: Rig, found: Findings) -> Estimate | None:

@@ -36,7 +36,7 @@ EVERY, NEAR_MM = 7, 0.5  # of the true points one is looked at; from the surface
 
 @dataclass(frozen=True)
 class Experiment:
-    """One rendered capture, reconstructed with the true calibration, and compared with its truth."""
+    """One rendered capture, reconstructed, and compared with its truth."""
 
     view: View
     truth: Truth
@@ -54,12 +54,16 @@ def experiment(
     tracing: Tracing = TRACING,
     shooting: Shooting = SHOOTING,
     conditions: Conditions = IDEAL,
+    calibrated: Rig | None = None,
 ) -> Experiment:
-    """Render, decode, triangulate, clean and compare, as the commands do, without the files between."""
+    """Render, decode, triangulate, clean and compare, as the commands do, without the files between.
+
+    calibrated : the rig as it is known where surfaces are reconstructed, if that isn't the true one
+    """
     view = shoot(rig, scene, patterns, "cam1", tracing, shooting, seed, conditions)
-    cameras = calibration_of(rig).cameras
+    cameras, known = (calibration_of(one).cameras for one in (rig, calibrated or rig))
     found = decode(view.images, patterns, name=scene.name)
-    points = clean(triangulate(found, cameras["cam1"], cameras["projector"]), cameras["cam1"], found.modulation)
+    points = clean(triangulate(found, known["cam1"], known["projector"]), known["cam1"], found.modulation)
     truth = Truth(
         **{field.name: getattr(view.truth, field.name) for field in fields(view.truth) if field.name != "projector"},
         limit_px=view.limit_px,

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from recon.identification.dark_frames import dark_moments, expected_moments, fit_dark
+from recon.identification.estimates import Estimate
 from recon.identification.photon_transfer import PhotonTransfer, TileNoise, noise_of_fringes, noise_of_patterns, transfer_line
 from recon.identification.sensors import (
     DarkStack,
@@ -16,6 +17,7 @@ from recon.identification.sensors import (
     PatternStack,
     identify_sensor,
     with_noise_as_seen,
+    without_light,
 )
 from recon.model.patterns import Patterns
 from recon.model.rig import Sensor
@@ -138,6 +140,16 @@ def test_figures_of_the_rig(shots):
         assert abs(estimate.value - truth) < 3.5 * estimate.sigma, name
         assert estimate.sigma < relative * truth, name
     assert set(found.unknown) == {"cam1.sensor.adc_bits", "cam1.sensor.quantum_efficiency"}
+
+
+@pytest.mark.parametrize(("bits", "adc_bits"), [(8, 8), (8, 10), (8, 12), (10, 12)])
+def test_pixels_without_light_show_the_black_level_less_what_is_cut_off(rig, bits, adc_bits):
+    """By 300 000 pixels of frames without light, to 0.01 DN of 8 bits; what is cut off is up to half a number."""
+    sensor = rig.cam1.sensor.model_copy(update={"adc_bits": adc_bits, "dark_noise_e": 20.0, "dark_current_e_per_s": 0.0})
+    shots = Shots(sensor, ImageSettings(bits, 1.0, adc_bits), 0.0, np.random.default_rng(9))
+    shown = without_light(Estimate(sensor.black_level_dn, 0.1, "a test"), shots.settings)
+    unit = 2.0 ** (bits - 8)
+    assert shots.dark().frames.mean() == pytest.approx(shown.value, abs=0.01 * unit) and shown.sigma == 0.1 * unit
 
 
 def test_flicker_is_no_noise(shots):

@@ -6,6 +6,8 @@ import pytest
 from recon.identification.estimates import Estimate, Findings
 from twin.conditions import Conditions, Frames
 from twin.experiments import drawn_rig, identify_trial
+from twin.optics.instruments import transmission
+from twin.optics.light_transport import Tracing
 from twin.ultrasound.transducer import Transducer
 
 
@@ -25,6 +27,38 @@ def test_errors_are_counted_in_their_sigmas(rig):
     assert figures["conditions_frames_flicker_over_sigma"] == pytest.approx(1)
 
 
+def test_a_richer_distortion_has_terms_that_the_rig_lacks(rig):
+    found = Findings({f"cam1.optics.distortion.{k}": Estimate(0.01, 0.02, "a test") for k in (0, 7)})
+    truth = identify_trial.truth_of(rig, Conditions(), Transducer(), found)
+    assert truth == {"cam1.optics.distortion.0": rig.cam1.optics.distortion[0], "cam1.optics.distortion.7": 0.0}
+
+
+def test_the_middle_of_an_image_sees_what_it_saw_in_the_whole(rig, rng):
+    """Places in the image, and the light that the lens lets pass."""
+    drawn, _ = drawn_rig.draw(rig, 3)
+    small = identify_trial.middle_of(drawn)
+    whole, part = drawn.cam1.optics.camera(), small.cam1.optics.camera()
+    points = whole.rays(rng.uniform(300, 400, (20, 2))) * 660
+    cut = (np.array(whole.size) - part.size) / 2
+    assert tuple(part.size) == identify_trial.MIDDLE_PX
+    assert part.project(points) == pytest.approx(whole.project(points) - cut, abs=1e-6)
+    u, v = cut.astype(int)
+    passed = (transmission(device.optics.camera(), device.lens) for device in (drawn.cam1, small.cam1))
+    full, middle = passed
+    assert middle == pytest.approx(full[v : v + part.size[1], u : u + part.size[0]], rel=1e-5)
+
+
+def test_settings_are_ranked_by_the_twin_of_the_rig_itself(rig, monkeypatch):
+    """Within 8 %, by few points and samples; a sheet that doesn't know the blur takes the fine fringes for better."""
+    monkeypatch.setattr(identify_trial, "MIDDLE_PX", (96, 80))
+    monkeypatch.setattr(identify_trial, "FINE_TRACING", Tracing(samples=128, room_lux=20))
+    drawn, conditions = drawn_rig.draw(rig, 0)
+    found = identify_trial.choose_setting(drawn, drawn, conditions, 0)
+    assert [found[f"{name}_predicted_over_found"] for name in identify_trial.SETTINGS] == pytest.approx([1, 1, 1], abs=0.08)
+    assert (found["ranked"], found["ranked_by_sheet"]) == (1, 0)
+    assert found["designed_found_mm"] < found["half_light_found_mm"] < found["fine_third_light_found_mm"]
+
+
 def test_the_sheet_holds_nothing_of_what_is_to_be_identified(rig):
     """Two drawn rigs of one size and one kind of pixels have sheets that differ in what images can't show alone."""
     drawn, _ = drawn_rig.draw(rig, 3)
@@ -38,6 +72,7 @@ def test_the_sheet_holds_nothing_of_what_is_to_be_identified(rig):
 def test_a_drawn_rig_is_identified_from_its_images(rig, tmp_path, monkeypatch):
     """Of some 60 numbers at least 85 % within their 95 % intervals, all within 6 sigma; the focal lengths to 0.1 %."""
     monkeypatch.setattr(identify_trial, "POSES", 8)
+    monkeypatch.setattr(identify_trial, "FRINGES_TRACING", dict.fromkeys(identify_trial.CAMERAS, identify_trial.TRACING))
     seed = 51
     drawn, conditions = drawn_rig.draw(rig, seed)
     array = drawn_rig.draw_scanner(np.random.default_rng([seed, 61]))
