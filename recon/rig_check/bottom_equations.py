@@ -60,7 +60,7 @@ class Known(NamedTuple):
     probe: ProbeCalibration  # for the tank's water
     lag_s: float
     lag_sigma_s: float
-    daily: Uncertainty | None = None  # of the probe, in its own too: by what is other each day, as the thermometer's error
+    daily: Uncertainty | None = None  # of the probe, by what is other each day, as the thermometer's error
 
 
 class Bottom(NamedTuple):

@@ -35,16 +35,14 @@ class Estimate(Part):
     """
 
     motion: tuple[Finite, ...] = Field(min_length=1)  # (k,)
-    whole: Covariance  # (k, k)
-    own: (
-        Covariance  # (k, k) of it by noise and by what is other each day; the rest, by the calibration, is the same in all checks
-    )
+    own: Covariance  # (k, k) by noise and by what is other each day
+    common: Covariance  # (k, k) by errors of the calibration, the same in all checks
     calibration: str  # digest of what it is against
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:
         k = len(self.motion)
-        for name, rows in (("whole", self.whole), ("own", self.own)):
+        for name, rows in (("own", self.own), ("common", self.common)):
             if [len(row) for row in rows] != [k] * k:
                 raise ValueError(f"{name}: expected {k} rows of {k} numbers, as motion has, found {[len(row) for row in rows]}")
             covariance = np.array(rows)
@@ -95,7 +93,7 @@ def entry(verdict: Verdict) -> Entry:
     known = {name: round(value, 5) if math.isfinite(value) else None for name, value in numbers.items()}
     found, estimate = verdict.finding, None
     if found is not None:
-        matrices = {name: tuple(map(tuple, getattr(found, name).tolist())) for name in ("whole", "own")}
+        matrices = {name: tuple(map(tuple, getattr(found, name).tolist())) for name in ("own", "common")}
         estimate = Estimate(motion=tuple(found.motion.tolist()), **matrices, calibration=verdict.calibration)
     told = {"part": verdict.part, "state": verdict.state, "motion": verdict.motion, "rivals": verdict.rivals}
     return Entry(**told, **known, estimate=estimate)

@@ -261,7 +261,7 @@ def _control_plot(chart: Chart) -> str:
     axes.plot(chart.times, one, "o", color=figures.BARS, markersize=3.0)
     axes.axhline(1.0, color=figures.TEXT, linewidth=1.0, linestyle="--")
     axes.set(ylabel="over its limit", xlim=_ends(chart.times), ylim=(0, 1.1 * max(1.2, one.max(), total.max())))
-    _date(axes, 5)
+    _date(axes)
     return figures.inline_svg(figure)
 
 
@@ -305,13 +305,13 @@ def _plot(log: Sequence[Check], axis: Axis, alarm: float | None = None) -> str:
         axes.axhline(alarm, color=figures.TEXT, linewidth=1.0, linestyle="--")
     axes.set(ylabel=f"deviation, {axis.unit}", yscale="log", xlim=(start, end), ylim=(0.8 * axis.floor, top))
     axes.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
-    _date(axes, 8)
+    _date(axes)
     return figures.inline_svg(figure)
 
 
-def _date(axes: Axes, ticks: int) -> None:
+def _date(axes: Axes) -> None:
     """Write dates along the axis of time."""
-    locator = dates.AutoDateLocator(maxticks=ticks)
+    locator = dates.AutoDateLocator(minticks=3, maxticks=8)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
     axes.spines[["top", "right"]].set_visible(False)

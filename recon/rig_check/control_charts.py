@@ -112,7 +112,7 @@ def limits(dimension: int, alarm_sigma: float) -> Limits:
 
 def innovations(estimates: Sequence[Estimate]) -> Array:
     """One-step errors of prediction : (n, k) of checks by one calibration: standard normal numbers where nothing drifts."""
-    left = _by_calibration(estimates[0])  # covariance of the mean
+    left = np.array(estimates[0].common)  # covariance of the mean
     mean, found = np.zeros(len(left)), []
     for one in estimates:
         missing = np.array(one.motion) - mean
@@ -123,27 +123,15 @@ def innovations(estimates: Sequence[Estimate]) -> Array:
     return np.array(found)
 
 
-def _by_calibration(estimate: Estimate) -> Array:
-    """Covariance : (k, k) of what stays the same until the next calibration; rounding may have left less than none of it."""
-    whole, own = np.array(estimate.whole), np.array(estimate.own)
-    unit, variances, axes = _principal(whole, whole - own)
-    return unit[:, None] * axes * np.maximum(variances, 0) @ axes.T * unit
-
-
 def _whitening(covariance: Array) -> Array:
     """The inverse of a covariance's symmetric root : (k, k), so that a direction stays one though covariances change a little.
 
     It is that of the correlations, over standard deviations; directions of no variance, which no check shows, stay at zero.
     """
-    unit, variances, axes = _principal(covariance, covariance)
-    return axes / np.sqrt(np.maximum(variances, SINGULAR)) @ axes.T / unit
-
-
-def _principal(whole: Array, part: Array) -> tuple[Array, Array, Array]:
-    """Standard deviations : (k,) of a covariance, and variances : (k,) and axes : (k, k) of a part of it in units of these."""
-    sigma = np.sqrt(np.maximum(np.diag(whole), 0))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
     unit = np.where(sigma > EXACT, sigma, 1.0)
-    return unit, *np.linalg.eigh(part / np.outer(unit, unit))
+    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return axes / np.sqrt(np.maximum(variances, SINGULAR)) @ axes.T / unit
 
 
 def cumulative_sums(innovations: Array) -> Array:
@@ -191,7 +179,7 @@ def change(times: Sequence[datetime], estimates: Sequence[Estimate]) -> Change:
     whitens = np.array([_whitening(np.array(one.own)) for one in estimates])
     weights = np.swapaxes(whitens, 1, 2) @ whitens
     pulls = np.einsum("nij,nj->ni", weights, np.array([one.motion for one in estimates]))
-    first = _whitening(_by_calibration(estimates[0]))
+    first = _whitening(np.array(estimates[0].common))
     alone, right = first.T @ first + weights.sum(axis=0), pulls.sum(axis=0)
     mixed, after = (np.einsum("sn,nij->sij", part, weights) for part in (shares, shares**2))
     across = np.swapaxes(np.linalg.solve(alone, mixed), 1, 2)  # Schur's complement of what was before
@@ -209,5 +197,5 @@ def drifting(charts: Sequence[Chart]) -> list[list[Chart]]:
     for together in (DEVICES, BY_BOTTOM):
         out = sorted((one for one in charts if one.out and one.part in together), key=lambda one: -one.change.gain)
         if out:
-            found.append([one for one in out if one.change.gain > out[0].change.gain - GAIN])
+            found.append([one for one in out if one.change.gain >= out[0].change.gain - GAIN])
     return found

@@ -40,7 +40,7 @@ class Equations:
     residuals: Array  # (m,)
     spread: Array  # (m, j) by independent standard normal numbers: what is uncertain, and not tested
     faults: Mapping[str, Fault]
-    daily: Array | None = None  # (m, d) the same of what is other each day, and in the spread too; the rest of it stays
+    daily: Array | None = None  # (m, d) the same of what is other each day, such as usual drift, for charts over days
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class Finding:
     motion: Array  # (k,) most likely one, of usual size
     covariance: Array  # (k, k) of it
     usual: Array  # (k,) as of the fault
-    whole: Array  # (k, k) covariance of the motion found where nothing moved
-    own: Array  # (k, k) of it by noise and what is other each day; the rest is the same in the next check
+    own: Array  # (k, k) covariance of the motion found where nothing moved, by noise and what is other each day
+    common: Array  # (k, k) the same by the spread, which may be the same in the next check
     named: bool  # whether it is told to have moved
     rivals: tuple[str, ...] = ()  # that explain all as well
 
@@ -137,9 +137,8 @@ def _tested(equations: Equations, fault: Fault) -> _Test:
     covariance = posterior * np.outer(sizes, sizes)
     response = sizes[:, None] * posterior @ weighed.T  # of the motion by the residuals
     daily = np.zeros((len(response), 0)) if equations.daily is None else response @ equations.daily
-    by_noise, by_rest = response @ response.T, response @ equations.spread
-    whole, own = (by_noise + each @ each.T for each in (by_rest, daily))
-    finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, whole, own, named=False)
+    own, common = (each @ each.T for each in (np.column_stack([response, daily]), response @ equations.spread))
+    finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, own, common, named=False)
     return _Test(finding, evidence, statistic)
 
 

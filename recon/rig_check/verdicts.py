@@ -71,7 +71,7 @@ def of_optics(
     """Verdicts on cameras, projector and target.
 
     known : the calibration's uncertainty, with what is usual since it was made, as of `recon.model.calibration.in_use`.
-    daily : what of it is other each day: usual drift.
+    daily : usual drift, as of `recon.rig_check.drift.usual_drift`, that is other each day.
     """
     return of_equations(equations_of(seen, calibration, known, target, daily), seen, calibration, target, alarm_sigma)
 

@@ -26,7 +26,7 @@ from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.errors import Implausible, InputError
 from recon.files import atomic
 from recon.model import circle_layout
-from recon.model.calibration import Calibration, in_use, with_drift
+from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Rig, Target
 from recon.probe_calibration import sound_in_water
@@ -231,7 +231,7 @@ def optics(
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
-    daily = with_drift(None, calibration.cameras, config.drift_px)
+    daily = drift.usual_drift(calibration.cameras, config.drift_px) if config.drift_px > 0 else None
     found = verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma, daily)
     against = check_log.digest(*numbers_of(calibration, target))
     found = [one._replace(calibration=against) for one in found]

@@ -26,7 +26,7 @@ def test_checks_are_read_as_they_were_added(tmp_path):
     assert len(log.read_text().splitlines()) == 2 and [path.name for path in log.parent.iterdir()] == ["rig.jsonl"]
 
 
-ESTIMATE = {"motion": [1e-3], "whole": [[4e-6]], "own": [[1e-6]], "calibration": "x"}
+ESTIMATE = {"motion": [1e-3], "own": [[1e-6]], "common": [[4e-6]], "calibration": "x"}
 
 
 def line_of(**changed) -> str:
@@ -37,7 +37,7 @@ def line_of(**changed) -> str:
 
 def test_motions_are_logged_with_what_they_are_against(tmp_path):
     """A line without them, of an earlier version, is read beside; digests of other numbers are others."""
-    found = Finding(0.5, 1, np.array([1e-3]), np.eye(1), np.ones(1), np.array([[4e-6]]), np.array([[1e-6]]), named=False)
+    found = Finding(0.5, 1, np.array([1e-3]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[4e-6]]), named=False)
     log = tmp_path / "rig.jsonl"
     log.write_text('{"time": "2026-01-01T00:00:00Z", "name": "x", "parts": [{"part": "clock", "state": "good", "sigma": 0.5}]}\n')
     check_log.add(log, check_log.check("today", [Verdict("clock", "good", 0.5, finding=found, calibration="x")]))
@@ -51,15 +51,15 @@ def test_motions_are_logged_with_what_they_are_against(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "told"),
     [
-        ({"motion": [0.0, 0.0]}, "whole: expected 2 rows of 2 numbers"),
-        ({"motion": [0.0] * 6, "whole": np.eye(6).tolist(), "own": np.eye(6).tolist()}, "expected 1 numbers of clock, found 6"),
+        ({"motion": [0.0, 0.0]}, "own: expected 2 rows of 2 numbers"),
+        ({"motion": [0.0] * 6, "own": np.eye(6).tolist(), "common": np.eye(6).tolist()}, "expected 1 numbers of clock, found 6"),
         ({"motion": []}, "motion"),
         ({"own": [[-1e-6]]}, "own: expected a covariance"),
         (
-            {"motion": [0.0] * 6, "own": np.eye(6).tolist(), "whole": np.tri(6).tolist()},
-            "whole: expected a covariance",
+            {"motion": [0.0] * 6, "own": np.eye(6).tolist(), "common": np.tri(6).tolist()},
+            "common: expected a covariance",
         ),
-        ({"whole": [[1e13]]}, "whole"),
+        ({"common": [[1e13]]}, "common"),
         ({"calibration": None}, "calibration"),
     ],
 )

@@ -79,7 +79,7 @@ def test_the_limit_stands_apart_from_the_deviation():
 def clocks(lags, calibration="x") -> list[check_log.Check]:
     """A check a day of a clock that is known to 5 ms, by checks good to 1 ms."""
     found = [
-        Finding(0.5, 1, np.array([lag]), np.eye(1), np.ones(1), np.array([[2.6e-5]]), np.array([[1e-6]]), False) for lag in lags
+        Finding(0.5, 1, np.array([lag]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[2.5e-5]]), False) for lag in lags
     ]
     verdicts = [Verdict("clock", "good", 0.5, 0.01, 0.02, finding=one, calibration=calibration) for one in found]
     made = [check_log.check("x", [one]) for one in verdicts]
@@ -97,7 +97,7 @@ def test_the_page_and_the_verdict_say_which_part_drifts_since_when_and_how_fast(
 
 
 def test_days_of_earlier_versions_are_said_to_be_missing_in_charts():
-    log = clocks([0.0] * 4)
+    log = clocks([0.0] * 5)
     old = [one.model_copy(update={"parts": (one.parts[0].model_copy(update={"estimate": None}),)}) for one in log[:2]]
     assert "2 checks of the log have no motions" in check_page.write_text(log[-1], [*old, *log[2:]], 3.2)
     assert "Control charts" not in check_page.write_text(old[-1], old, 3.2)

@@ -22,9 +22,8 @@ def estimates(rng, part, days, claimed=10.0, drift=None, calibration="first"):
     for moved in drift:
         noise = sigma[:, None] * axes * rng.uniform(2 / 3, 4 / 3, k)
         own = noise @ noise.T
-        whole = own + np.diag((claimed * sigma) ** 2)
         motion = error + noise @ rng.standard_normal(k) + moved * sigma * np.eye(k)[0]
-        matrices = {"whole": whole.tolist(), "own": own.tolist()}
+        matrices = {"own": own.tolist(), "common": np.diag((claimed * sigma) ** 2).tolist()}
         found.append(Estimate.model_construct(motion=tuple(motion), **matrices, calibration=calibration))
     return found
 
@@ -125,11 +124,9 @@ def test_a_step_is_told_from_drift(rng):
 
 
 def test_the_best_part_is_named_with_its_rivals(rng):
-    """Camera 2 steps by 4 sigma; camera 1 seems to by as much, the target by a third; the clock is of other measurements."""
+    """Camera 2 steps by 4 sigma; camera 1 seems to by as much, the target by less; the clock is of other measurements."""
     out = np.repeat([0.0, 4.0], 10)
-    made = {
-        part: estimates(rng, part, 20, 1.0, out * share) for part, share in (("cam2", 1.0), ("target", 1 / 3), ("clock", 1.0))
-    }
+    made = {part: estimates(rng, part, 20, 1.0, out * share) for part, share in (("cam2", 1.0), ("target", 0.6), ("clock", 1.0))}
     charts = [control_charts.charts(logged(part, course), 3.2)[0] for part, course in made.items()]
     twin = charts[0]._replace(part="cam1", change=charts[0].change._replace(gain=charts[0].change.gain - 1))
     named = [[one.part for one in rivals] for rivals in control_charts.drifting([twin, *charts])]
@@ -159,7 +156,7 @@ def test_what_no_check_shows_stays_at_zero(rng):
     course = []
     for one in estimates(rng, "target", 6):
         blind = np.diag([1.0, 1.0, 0.0])
-        parts = {"whole": (blind @ one.whole @ blind).tolist(), "own": (blind @ one.own @ blind).tolist()}
+        parts = {"common": (blind @ one.common @ blind).tolist(), "own": (blind @ one.own @ blind).tolist()}
         course.append(one.model_copy(update={"motion": tuple(blind @ one.motion), **parts}))
     steps = control_charts.innovations(course)
     assert np.abs(steps[:, 2]).max() < 1e-6 and np.isfinite(steps).all()
