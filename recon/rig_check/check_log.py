@@ -37,7 +37,7 @@ class Estimate(Part):
     motion: tuple[Finite, ...] = Field(min_length=1)  # (k,)
     own: Covariance  # (k, k) by noise and by what is other each day
     common: Covariance  # (k, k) by errors of the calibration, the same in all checks
-    calibration: str  # digest of what it is against
+    against: str  # digest of what it was found by: calibration, and kinds of recordings
 
     @model_validator(mode="after")
     def _of_one_size(self) -> Self:
@@ -94,7 +94,7 @@ def entry(verdict: Verdict) -> Entry:
     found, estimate = verdict.finding, None
     if found is not None:
         matrices = {name: tuple(map(tuple, getattr(found, name).tolist())) for name in ("own", "common")}
-        estimate = Estimate(motion=tuple(found.motion.tolist()), **matrices, calibration=verdict.calibration)
+        estimate = Estimate(motion=tuple(found.motion.tolist()), **matrices, against=verdict.against)
     told = {"part": verdict.part, "state": verdict.state, "motion": verdict.motion, "rivals": verdict.rivals}
     return Entry(**told, **known, estimate=estimate)
 

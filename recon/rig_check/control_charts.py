@@ -15,7 +15,6 @@ rate of false alarms, together that of the verdict on the part.
 from collections.abc import Sequence
 from datetime import datetime
 from functools import cache
-from itertools import groupby
 from math import erfc
 from typing import NamedTuple
 
@@ -79,7 +78,7 @@ class Chart(NamedTuple):
 
 
 def charts(log: Sequence[Check], alarm_sigma: float) -> list[Chart]:
-    """Charts of the parts that the last check of a log shows, each since its last calibration, if two checks or more are.
+    """Charts of the parts that the last check of a log shows, each over the checks by its present calibration, if two or more.
 
     alarm_sigma : of the verdict on a part, whose chance of a false alarm both charts of the part share.
     """
@@ -88,7 +87,8 @@ def charts(log: Sequence[Check], alarm_sigma: float) -> list[Chart]:
         shown = [(made.time, one.estimate) for made in log for one in made.parts if one.part == part and one.estimate is not None]
         if not shown or shown[-1][0] != log[-1].time:
             continue
-        *_, own = (list(group) for _, group in groupby(shown, lambda one: (one[1].calibration, len(one[1].motion))))
+        last = shown[-1][1]
+        own = [each for each in shown if (each[1].against, len(each[1].motion)) == (last.against, len(last.motion))]
         if len(own) > 1:
             times, estimates = zip(*own, strict=True)
             found.append(_chart(part, times, estimates, alarm_sigma))
@@ -139,8 +139,7 @@ def cumulative_sums(innovations: Array) -> Array:
     total, sums = np.zeros(innovations.shape[1]), []
     for one in innovations:
         total = total + one
-        length = float(np.linalg.norm(total))
-        total = total * max(0.0, 1 - ALLOWANCE / length) if length > 0 else total
+        total = total * (1 - ALLOWANCE / max(float(np.linalg.norm(total)), ALLOWANCE))
         sums.append(total)
     return np.array(sums)
 

@@ -50,7 +50,7 @@ class Verdict(NamedTuple):
     motion: str = ""  # in words
     rivals: tuple[str, ...] = ()  # that explain all as well
     finding: Finding | None = None
-    calibration: str = ""  # digest of what it was checked against
+    against: str = ""  # digest of what it was checked by: calibration, and kinds of recordings
 
 
 class Optics(NamedTuple):

@@ -63,7 +63,7 @@ class Config(MeasuredTargetFields):
     out: Path
     """folder: gets check.html, check.json, and optics.yaml, corrected for drift, where no device was moved"""
     log: Path | None = None
-    """file of all checks, a line each, that this one is added to, such as rig.jsonl; null keeps no log"""
+    """file of all checks, a line each, that this one is added to, such as rig.jsonl; null: no log, and no control charts"""
     film: manifest.SweepNameOrNone = ""
     """name of the sweep in which the target is moved about; "" takes the only one with frames and without B-scans"""
     bottom: manifest.SweepNameOrNone = ""
@@ -233,8 +233,9 @@ def optics(
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
     daily = drift.usual_drift(calibration.cameras, config.drift_px) if config.drift_px > 0 else None
     found = verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma, daily)
-    against = check_log.digest(*numbers_of(calibration, target))
-    found = [one._replace(calibration=against) for one in found]
+    kinds = np.array([film is not None, *(() if matches is None else matches.axes)])
+    against = check_log.digest(*numbers_of(calibration, target), kinds)
+    found = [one._replace(against=against) for one in found]
     if config.drift_px == 0 or any(one.state in ("moved", "maybe") for one in found):
         return found, None
     corrected = drift_step.correct(calibration, matches, film or (), target, config)
@@ -299,7 +300,7 @@ def tank(config: Config, capture: Path, held: Held, watch: ConsoleWatch) -> list
     devices = numbers_of(calibration_files.of_capture(capture, config.calibration), target_of(config))
     clock = None if lag is None else np.array([lag.lag_s])
     against = check_log.digest(*devices, probe.target_from_image, probe.scale, clock)
-    found = [one._replace(calibration=against) for one in found]
+    found = [one._replace(against=against) for one in found]
     return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
 
 

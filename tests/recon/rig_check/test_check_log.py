@@ -26,7 +26,7 @@ def test_checks_are_read_as_they_were_added(tmp_path):
     assert len(log.read_text().splitlines()) == 2 and [path.name for path in log.parent.iterdir()] == ["rig.jsonl"]
 
 
-ESTIMATE = {"motion": [1e-3], "own": [[1e-6]], "common": [[4e-6]], "calibration": "x"}
+ESTIMATE = {"motion": [1e-3], "own": [[1e-6]], "common": [[4e-6]], "against": "x"}
 
 
 def line_of(**changed) -> str:
@@ -40,7 +40,7 @@ def test_motions_are_logged_with_what_they_are_against(tmp_path):
     found = Finding(0.5, 1, np.array([1e-3]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[4e-6]]), named=False)
     log = tmp_path / "rig.jsonl"
     log.write_text('{"time": "2026-01-01T00:00:00Z", "name": "x", "parts": [{"part": "clock", "state": "good", "sigma": 0.5}]}\n')
-    check_log.add(log, check_log.check("today", [Verdict("clock", "good", 0.5, finding=found, calibration="x")]))
+    check_log.add(log, check_log.check("today", [Verdict("clock", "good", 0.5, finding=found, against="x")]))
     old, new = (made.parts[0].estimate for made in check_log.read(log))
     assert old is None and new == check_log.Estimate.model_validate(ESTIMATE)
     numbers = np.arange(3.0)
@@ -60,7 +60,7 @@ def test_motions_are_logged_with_what_they_are_against(tmp_path):
             "common: expected a covariance",
         ),
         ({"common": [[1e13]]}, "common"),
-        ({"calibration": None}, "calibration"),
+        ({"against": None}, "against"),
     ],
 )
 def test_a_motion_that_is_none_is_refused(tmp_path, changed, told):

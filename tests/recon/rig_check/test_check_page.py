@@ -76,12 +76,12 @@ def test_the_limit_stands_apart_from_the_deviation():
     assert third.split() == ["probe", "on", "its", "bracket", "not", "checked"]
 
 
-def clocks(lags, calibration="x") -> list[check_log.Check]:
+def clocks(lags) -> list[check_log.Check]:
     """A check a day of a clock that is known to 5 ms, by checks good to 1 ms."""
     found = [
         Finding(0.5, 1, np.array([lag]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[2.5e-5]]), False) for lag in lags
     ]
-    verdicts = [Verdict("clock", "good", 0.5, 0.01, 0.02, finding=one, calibration=calibration) for one in found]
+    verdicts = [Verdict("clock", "good", 0.5, 0.01, 0.02, finding=one) for one in found]
     made = [check_log.check("x", [one]) for one in verdicts]
     return [one.model_copy(update={"time": FIRST + timedelta(days=day)}) for day, one in enumerate(made)]
 

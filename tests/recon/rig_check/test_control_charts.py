@@ -24,7 +24,7 @@ def estimates(rng, part, days, claimed=10.0, drift=None, calibration="first"):
         own = noise @ noise.T
         motion = error + noise @ rng.standard_normal(k) + moved * sigma * np.eye(k)[0]
         matrices = {"own": own.tolist(), "common": np.diag((claimed * sigma) ** 2).tolist()}
-        found.append(Estimate.model_construct(motion=tuple(motion), **matrices, calibration=calibration))
+        found.append(Estimate.model_construct(motion=tuple(motion), **matrices, against=calibration))
     return found
 
 
@@ -138,7 +138,9 @@ def test_a_new_calibration_begins_a_chart(rng):
     old, new = (estimates(rng, "clock", 10, calibration=name) for name in ("first", "second"))
     chart = control_charts.charts(logged("clock", [*old, *new]), 3.2)[0]
     assert len(chart.times) == 10 and chart.times[0] == FIRST + timedelta(days=10)
-    taken_for_one = [one.model_copy(update={"calibration": "first"}) for one in new]
+    mixed = [one for pair in zip(old, new, strict=True) for one in pair]
+    assert len(control_charts.charts(logged("clock", mixed), 3.2)[0].times) == 10
+    taken_for_one = [one.model_copy(update={"against": "first"}) for one in new]
     assert control_charts.charts(logged("clock", [*old, *taken_for_one]), 3.2)[0].out and not chart.out
 
 
