@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 DEVICES, BY_BOTTOM = PARTS[:4], PARTS[4:]  # parts that the same measurements show
 ALLOWANCE = 0.5  # standard deviations a check, that the sum forgets: half of a shift that it finds soonest
-SINGULAR = 1e-9  # of a variance, added: directions that no check shows have none
+SINGULAR = 1e-9  # of a variance, at least: directions that no check shows have none
 NODES = 48  # of Gauss's rule over the sum, for its average run length: to 1e-6 of it
 SELDOM = 1e-6  # chance of a false alarm, below which no limits are set
 GAIN = 2 * fault_tests.RIVAL  # of chi-square, below the best one's: another part that may be it
