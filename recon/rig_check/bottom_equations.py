@@ -21,6 +21,7 @@ from recon.estimation.equations import eliminate
 from recon.geometry import rigid
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model import tracks
+from recon.model.calibration import Uncertainty
 from recon.model.probe import NAMES, ProbeCalibration, place_slopes
 from recon.model.tracks import Track
 from recon.probe_calibration import latency
@@ -59,6 +60,7 @@ class Known(NamedTuple):
     probe: ProbeCalibration  # for the tank's water
     lag_s: float
     lag_sigma_s: float
+    daily: Uncertainty | None = None  # of the probe, by what is other each day, as the thermometer's error
 
 
 class Bottom(NamedTuple):
@@ -156,11 +158,12 @@ def equations(lines: Lines, track: Track, known: Known, bottom: Bottom) -> Equat
     uncertain = [by_lag * known.lag_sigma_s]
     if probe.uncertainty is not None:
         uncertain.append(by_probe @ root(probe.uncertainty.ordered(NAMES)))
+    daily = None if known.daily is None else by_probe @ root(known.daily.ordered(NAMES))
     faults = {PROBE: Fault(by_probe[:, 2:], USUAL_BEND), CLOCK: Fault(by_lag, USUAL_LAG)}
-    whole = Equations(free[:, 0], np.column_stack(uncertain), faults)
+    whole = Equations(free[:, 0], np.column_stack(uncertain), faults, daily)
     factor = fault_tests.noise_factor(whole)
     faults = {name: Fault(fault.slopes / factor, fault.usual) for name, fault in faults.items()}
-    return Equations(whole.residuals / factor, whole.spread / factor, faults)
+    return Equations(whole.residuals / factor, whole.spread / factor, faults, None if daily is None else daily / factor)
 
 
 def _noise(placed: _Placed, lines: Lines, track: Track, known: Known, bottom: Bottom) -> Array:

@@ -6,11 +6,13 @@ from math import erfc
 from typing import NamedTuple
 
 from matplotlib import dates, ticker
+from matplotlib.axes import Axes
 
 from recon.reports import figures, page
 from recon.reports.page import Opening, Section
-from recon.rig_check import rig_versions
+from recon.rig_check import control_charts, rig_versions
 from recon.rig_check.check_log import Check, Entry
+from recon.rig_check.control_charts import Chart
 from recon.rig_check.rig_versions import Comparison
 from recon.rig_check.verdicts import ANEW, PARTS, TITLES
 
@@ -51,14 +53,16 @@ FOOTER = (
 
 def write_text(made: Check, log: Sequence[Check], alarm_sigma: float) -> str:
     """The page as HTML."""
+    charts = control_charts.charts(log, alarm_sigma)
     numbers = [] if made.rig is None else [Section("Numbers of the rig", _numbers(made.rig, log))]
     sections = [
         Section("Parts", [page.table(("part", "verdict", "motion", "limit, 1 σ", "deviation", "in mm"), map(_row, made.parts))]),
         *numbers,
         *([Section("Over the days", _course(log, alarm_sigma))] if any(map(_shows_parts, log)) else []),
+        *([Section("Control charts", _control(charts, log))] if charts else []),
         Section("How to read this", [page.paragraph(text) for text in reading(alarm_sigma)]),
     ]
-    return page.render(Opening("Check of the rig", made.name, summary(made), _figures(made)), sections, FOOTER)
+    return page.render(Opening("Check of the rig", made.name, summary(made, charts), _figures(made)), sections, FOOTER)
 
 
 def reading(alarm_sigma: float) -> tuple[str, ...]:
@@ -75,8 +79,8 @@ def reading(alarm_sigma: float) -> tuple[str, ...]:
     )
 
 
-def summary(made: Check) -> str:
-    """What has moved or changed, and what is to be done, in a sentence or two."""
+def summary(made: Check, charts: Sequence[Chart] = ()) -> str:
+    """What has moved, drifted or changed, and what is to be done, in some sentences."""
     parts, told = made.parts, list[str]()
     moved = [one for one in parts if one.state == "moved"]
     if moved:
@@ -85,6 +89,11 @@ def summary(made: Check) -> str:
     else:
         names = {state: ", ".join(TITLES[one.part] for one in parts if one.state == state) for state in ("good", "open")}
         told = [f"{word}: {names[state]}." for state, word in (("good", "As calibrated"), ("open", "Open")) if names[state]]
+        drifting = control_charts.drifting(charts)
+        if drifting:
+            named = "; ".join(f"{' or '.join(TITLES[one.part] for one in rivals)} {rivals[0].told}" for rivals in drifting)
+            verbs = _verbs([[one.part for one in rivals] for rivals in drifting])
+            told += [f"Out of control over the days: {named}. Run {', '.join(verbs)}."]
     if made.rig is not None and made.rig.changed:
         told += [f"Changed: {rig_versions.told(made.rig.changed)}. If it is meant, go on with today's file of the rig."]
     elif made.rig is not None:
@@ -94,7 +103,11 @@ def summary(made: Check) -> str:
 
 def anew(parts: Sequence[Entry]) -> list[str]:
     """Calibrations that are to be made again, in their order."""
-    needed = {ANEW[one.part] for one in parts if one.state in ("moved", "maybe")}
+    return _verbs([[one.part for one in parts if one.state in ("moved", "maybe")]])
+
+
+def _verbs(groups: Sequence[Sequence[str]]) -> list[str]:
+    needed = {ANEW[part] for group in groups for part in group}
     return [verb for verb in dict.fromkeys(ANEW.values()) if verb in needed]
 
 
@@ -205,6 +218,53 @@ def _shows_parts(made: Check) -> bool:
     return any(one.sigma is not None for one in made.parts)
 
 
+def _control(charts: Sequence[Chart], log: Sequence[Check]) -> list[str]:
+    """Control charts of all parts, with their state in words."""
+    limit = charts[0].limits
+    rows = [
+        (
+            TITLES[one.part],
+            f"{one.sigma[-1]:.1f} σ",
+            f"{one.cusum[-1]:.1f}, limit {one.limits.cusum:.1f}",
+            one.told if one.out else "in control",
+        )
+        for one in charts
+    ]
+    table = page.table(("part", "today beside all earlier", "cumulative sum", "state"), rows)
+    charted = {one.part for one in charts}
+    old = sum(any(one.sigma is not None and one.estimate is None and one.part in charted for one in made.parts) for made in log)
+    left_out = (
+        f"{old} check{'s' * (old != 1)} of the log have no motions beside deviations, as they are of an earlier version, or were "
+        "tracked by cameras that moved: they aren't in the charts."
+    )
+    drawings = [
+        page.drawing(_control_plot(one), TITLES[one.part], f"{len(one.times)} checks since {one.times[0]:%Y-%m-%d}.")
+        for one in charts
+    ]
+    key = page.key({"one check, beside all earlier": figures.BARS, "cumulative sum": figures.LINE})
+    reading = (
+        "Here the calibration's error cancels, as it is the same in all checks by one calibration: each check's motion is held "
+        "against the mean of the earlier ones, in standard deviations of noise and usual drift. A cumulative sum shows what goes "
+        f"on slowly in one direction. While nothing drifts, each passes its limit once in {limit.run_length:.0f} checks: "
+        f"one check {limit.sigma:.1f} σ, the sum that in the table. Of parts that are seen together, all may be beyond where one "
+        "drifts.",
+        *([left_out] if old else []),
+    )
+    return [*map(page.paragraph, reading), table, key, page.grid(drawings, "two")]
+
+
+def _control_plot(chart: Chart) -> str:
+    """Both charts over time, over their limits."""
+    figure, axes = figures.blank(4.8, 2.4)
+    one, total = chart.sigma / chart.limits.sigma, chart.cusum / chart.limits.cusum
+    axes.plot(chart.times, total, "-", color=figures.LINE, linewidth=1.4)
+    axes.plot(chart.times, one, "o", color=figures.BARS, markersize=3.0)
+    axes.axhline(1.0, color=figures.TEXT, linewidth=1.0, linestyle="--")
+    axes.set(ylabel="over its limit", xlim=_ends(chart.times), ylim=(0, 1.1 * max(1.2, one.max(), total.max())))
+    _date(axes)
+    return figures.inline_svg(figure)
+
+
 def _course(log: Sequence[Check], alarm_sigma: float) -> list[str]:
     """Deviations of all checks in the log, in standard deviations and in mm."""
     seen = {one.part for made in log for one in made.parts if one.sigma is not None}
@@ -219,7 +279,11 @@ def _course(log: Sequence[Check], alarm_sigma: float) -> list[str]:
 
 def span(log: Sequence[Check]) -> tuple[datetime, datetime]:
     """Ends of the axis of time."""
-    first, last = min(made.time for made in log), max(made.time for made in log)
+    return _ends([made.time for made in log])
+
+
+def _ends(times: Sequence[datetime]) -> tuple[datetime, datetime]:
+    first, last = min(times), max(times)
     margin = max(ASIDE, MARGIN * (last - first))
     return first - margin, last + margin
 
@@ -241,8 +305,13 @@ def _plot(log: Sequence[Check], axis: Axis, alarm: float | None = None) -> str:
         axes.axhline(alarm, color=figures.TEXT, linewidth=1.0, linestyle="--")
     axes.set(ylabel=f"deviation, {axis.unit}", yscale="log", xlim=(start, end), ylim=(0.8 * axis.floor, top))
     axes.yaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
-    locator = dates.AutoDateLocator(maxticks=8)
+    _date(axes)
+    return figures.inline_svg(figure)
+
+
+def _date(axes: Axes) -> None:
+    """Write dates along the axis of time."""
+    locator = dates.AutoDateLocator(minticks=3, maxticks=8)
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(dates.ConciseDateFormatter(locator))
     axes.spines[["top", "right"]].set_visible(False)
-    return figures.inline_svg(figure)

@@ -40,6 +40,7 @@ class Equations:
     residuals: Array  # (m,)
     spread: Array  # (m, j) by independent standard normal numbers: what is uncertain, and not tested
     faults: Mapping[str, Fault]
+    daily: Array | None = None  # (m, d) the same of what is other each day, such as usual drift, for charts over days
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class Finding:
     motion: Array  # (k,) most likely one, of usual size
     covariance: Array  # (k, k) of it
     usual: Array  # (k,) as of the fault
+    own: Array  # (k, k) covariance of the motion found where nothing moved, by noise and what is other each day
+    common: Array  # (k, k) the same by the spread, which may be the same in the next check
     named: bool  # whether it is told to have moved
     rivals: tuple[str, ...] = ()  # that explain all as well
 
@@ -112,7 +115,10 @@ def find(equations: Equations, alarm_sigma: float) -> dict[str, Finding]:
         found[best] = replace(tests[best].finding, named=True, rivals=rivals)
         motion = equations.faults[best].slopes * (10 * equations.faults[best].usual)  # uncertain, and not tested any more
         others = {name: fault for name, fault in equations.faults.items() if name != best}
-        equations = Equations(equations.residuals, np.column_stack([equations.spread, motion]), others)
+        spread, daily = (
+            motion if each is None else np.column_stack([each, motion]) for each in (equations.spread, equations.daily)
+        )
+        equations = Equations(equations.residuals, spread, others, daily)
 
 
 def _tested(equations: Equations, fault: Fault) -> _Test:
@@ -129,7 +135,10 @@ def _tested(equations: Equations, fault: Fault) -> _Test:
     evidence = 0.5 * float(right @ motion - np.sum(np.log1p(np.maximum(values, 0))))
     freedom, sizes = int(shown.sum()), fault.usual
     covariance = posterior * np.outer(sizes, sizes)
-    finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, named=False)
+    response = sizes[:, None] * posterior @ weighed.T  # of the motion by the residuals
+    daily = np.zeros((len(response), 0)) if equations.daily is None else response @ equations.daily
+    own, common = (each @ each.T for each in (np.column_stack([response, daily]), response @ equations.spread))
+    finding = Finding(as_sigma(statistic, freedom), freedom, sizes * motion, covariance, sizes, own, common, named=False)
     return _Test(finding, evidence, statistic)
 
 

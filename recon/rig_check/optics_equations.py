@@ -7,6 +7,7 @@ target shows.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -145,10 +146,17 @@ def points_by_light(pixels: Array, shown: Array, axes: Sequence[int], cameras: M
 
 
 def assemble(
-    film: DeviceRows | None, fringes: DeviceRows | None, target: Target, known: Uncertainty, names: Sequence[str]
+    film: DeviceRows | None,
+    fringes: DeviceRows | None,
+    target: Target,
+    known: Uncertainty,
+    names: Sequence[str],
+    daily: Uncertainty | None = None,
 ) -> Equations:
     """All equations with their faults: a motion of each device, and a target of other lengths."""
-    return _equations(combine(film, fringes, target, known, names), target, known, names)
+    rows = combine(film, fringes, target, known, names)
+    equations = _equations(rows, target, known, names)
+    return equations if daily is None else replace(equations, daily=rows.by_optics @ root(daily.ordered(names)))
 
 
 def combine(

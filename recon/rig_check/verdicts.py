@@ -49,6 +49,8 @@ class Verdict(NamedTuple):
     mm_sigma: float = np.nan  # standard deviation of that: smaller deviations aren't found
     motion: str = ""  # in words
     rivals: tuple[str, ...] = ()  # that explain all as well
+    finding: Finding | None = None
+    against: str = ""  # digest of what it was checked by: calibration, and kinds of recordings
 
 
 class Optics(NamedTuple):
@@ -58,15 +60,25 @@ class Optics(NamedTuple):
     matches: Matches | None
 
 
-def of_optics(seen: Optics, calibration: Calibration, known: Uncertainty, target: Target, alarm_sigma: float) -> list[Verdict]:
+def of_optics(
+    seen: Optics,
+    calibration: Calibration,
+    known: Uncertainty,
+    target: Target,
+    alarm_sigma: float,
+    daily: Uncertainty | None = None,
+) -> list[Verdict]:
     """Verdicts on cameras, projector and target.
 
     known : the calibration's uncertainty, with what is usual since it was made, as of `recon.model.calibration.in_use`.
+    daily : usual drift, as of `recon.rig_check.drift.usual_drift`, that is other each day.
     """
-    return of_equations(equations_of(seen, calibration, known, target), seen, calibration, target, alarm_sigma)
+    return of_equations(equations_of(seen, calibration, known, target, daily), seen, calibration, target, alarm_sigma)
 
 
-def equations_of(seen: Optics, calibration: Calibration, known: Uncertainty, target: Target) -> Equations:
+def equations_of(
+    seen: Optics, calibration: Calibration, known: Uncertainty, target: Target, daily: Uncertainty | None = None
+) -> Equations:
     """Equations of cameras, projector and target by all that was taken; points that disagree with most others are left out."""
     cameras, names = calibration.cameras, optics_equations.parameters(known, list(calibration.cameras))
     film = None if seen.film is None else optics_equations.of_film(seen.film, target, names)
@@ -75,7 +87,7 @@ def equations_of(seen: Optics, calibration: Calibration, known: Uncertainty, tar
         each = 2 * len(seen.matches.axes) - 1
         fringes = optics_equations.of_fringes(seen.matches, cameras, target, names)
         fringes = optics_equations.agreeing(fringes, target, known, names, each)
-    return optics_equations.assemble(film, fringes, target, known, names)
+    return optics_equations.assemble(film, fringes, target, known, names, daily)
 
 
 def of_equations(
@@ -133,14 +145,17 @@ def _verdicts(findings: Mapping[str, Finding], effects: Mapping[str, Array], par
         sigma = float(np.sqrt(np.einsum("ni,ij,nj->", effect, finding.covariance, effect) / count))
         usual = float(np.sqrt(np.sum((effect * finding.usual) ** 2) / count))
         state: State = "moved" if finding.named else "maybe" if part in doubtful else "open" if sigma > BLIND * usual else "good"
-        verdicts.append(Verdict(part, state, finding.sigma, mm, sigma, described(part, finding.motion), finding.rivals))
+        words = described(part, finding.motion)
+        verdicts.append(Verdict(part, state, finding.sigma, mm, sigma, words, finding.rivals, finding))
     return verdicts
 
 
 def doubted(verdicts: Sequence[Verdict], by: Sequence[Verdict]) -> list[Verdict]:
     """Verdicts on what was tracked by cameras that may have moved: what seems to have moved beside them stays open."""
-    moved = any(one.state in ("moved", "maybe") and one.part != PROJECTOR for one in by)
-    return [one._replace(state="open") if moved and one.state in ("moved", "maybe") else one for one in verdicts]
+    if not any(one.state in ("moved", "maybe") and one.part != PROJECTOR for one in by):
+        return list(verdicts)
+    unsure = [one._replace(finding=None) for one in verdicts]
+    return [one._replace(state="open") if one.state in ("moved", "maybe") else one for one in unsure]
 
 
 def described(part: str, motion: Array) -> str:

@@ -6,14 +6,15 @@ with fringes along both axes; and ten seconds of tracked B-scans over a flat, ro
 moved up and down. Compares the rig that `sonotwin identify` made of today's captures, `today=FOLDER`, number by number with an
 earlier one, `rig=FILE`; `capture` may then be left out. Writes into the folder `out` check.html, the verdicts with their course
 over the days of `log`, and check.json. An error that the calibrations admit by their covariance, and usual drift, are no alarm;
-where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Exit status 1 if something has
-moved or changed. Takes some seconds.
+where nothing else has moved, optics.yaml beside them is the calibration corrected for such drift. Control charts over the days of
+`log` find drift that no single check shows. Exit status 1 if something has moved, drifted or changed. Takes some seconds.
 
     sonotwin check capture=outputs/morning out=outputs/check log=outputs/rig.jsonl lag=outputs/lag/lag.json
     sonotwin check capture=outputs/morning film=target tracked=outputs/tracked lag=outputs/lag/lag.json out=outputs/check
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -24,12 +25,13 @@ from recon.capture import calibration_files, lag_files, manifest, probe_files, s
 from recon.capture.manifest import CAMERAS, MANIFEST, SCANNER, Manifest
 from recon.errors import Implausible, InputError
 from recon.files import atomic
+from recon.model import circle_layout
 from recon.model.calibration import Calibration, in_use
 from recon.model.probe import ProbeCalibration
 from recon.model.rig import NotNegative, Positive, Rig, Target
 from recon.probe_calibration import sound_in_water
 from recon.registry import Choice
-from recon.rig_check import bottom_equations, check_log, check_page, drift, rig_versions, verdicts
+from recon.rig_check import bottom_equations, check_log, check_page, control_charts, drift, rig_versions, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.optics_equations import PROJECTOR
 from recon.rig_check.rig_versions import Comparison
@@ -61,7 +63,7 @@ class Config(MeasuredTargetFields):
     out: Path
     """folder: gets check.html, check.json, and optics.yaml, corrected for drift, where no device was moved"""
     log: Path | None = None
-    """file of all checks, a line each, that this one is added to, such as rig.jsonl; null keeps no log"""
+    """file of all checks, a line each, that this one is added to, such as rig.jsonl; null: no log, and no control charts"""
     film: manifest.SweepNameOrNone = ""
     """name of the sweep in which the target is moved about; "" takes the only one with frames and without B-scans"""
     bottom: manifest.SweepNameOrNone = ""
@@ -97,7 +99,7 @@ class Held(NamedTuple):
 
 
 def run(config: Config) -> int:
-    """Read, test and write; returns 1 if something has moved.
+    """Read, test and write; returns 1 if something has moved, drifted or changed.
 
     Raises
     ------
@@ -131,16 +133,19 @@ def run(config: Config) -> int:
     if any(one.state == "moved" and one.mm > FAR_MM for one in found if one.part in DEVICES):
         cause = "is it this rig's calibration, and are the images each camera's own?"
         watch.say(f"warning     motions of {FAR_MM:g} mm and more are told roughly, and others may be named for them: {cause}")
-    watch.say(f"verdict     {check_page.summary(made)}")
+    log = [*earlier, made]
+    charts = control_charts.charts(log, config.alarm_sigma)
+    watch.say(f"verdict     {check_page.summary(made, charts)}")
     with atomic.new_folder(config.out, "check") as folder:
         (folder / CHECK).write_text(made.model_dump_json(indent=2) + "\n", encoding="utf-8")
-        (folder / PAGE).write_text(check_page.write_text(made, [*earlier, made], config.alarm_sigma), encoding="utf-8")
+        (folder / PAGE).write_text(check_page.write_text(made, log, config.alarm_sigma), encoding="utf-8")
         if corrected is not None:
             calibration_files.write(folder / drift_step.OPTICS, corrected)
         if config.log is not None:  # last, so that whatever fails leaves both as they were
             check_log.add(config.log, made)
     watch.say(f"wrote       {config.out}/{{{','.join([CHECK, PAGE, *([drift_step.OPTICS] if corrected else [])])}}}")
-    return int(any(one.state == "moved" for one in found) or (rig is not None and len(rig.changed) > 0))
+    moved = any(one.state == "moved" for one in found) or any(one.out for one in charts)
+    return int(moved or (rig is not None and len(rig.changed) > 0))
 
 
 def compared(config: Config, today: Path) -> Comparison:
@@ -226,7 +231,11 @@ def optics(
     known = in_use(calibration.uncertainty, calibration.cameras, config.board_scale, config.drift_px)
     if known is None:
         raise InputError("drift_px: expected more than 0 beside a calibration without covariance, found 0")
-    found = verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma)
+    daily = drift.usual_drift(calibration.cameras, config.drift_px) if config.drift_px > 0 else None
+    found = verdicts.of_optics(Optics(film, matches), calibration, known, target, config.alarm_sigma, daily)
+    kinds = np.array([film is not None, *(() if matches is None else matches.axes)])
+    against = check_log.digest(*numbers_of(calibration, target), kinds)
+    found = [one._replace(against=against) for one in found]
     if config.drift_px == 0 or any(one.state in ("moved", "maybe") for one in found):
         return found, None
     corrected = drift_step.correct(calibration, matches, film or (), target, config)
@@ -236,6 +245,13 @@ def optics(
         watch.say(f"warning     not corrected: {corrected.beyond(config.drift_px)}")
         return found, None
     return found, corrected.calibration
+
+
+def numbers_of(calibration: Calibration | None, target: Target) -> list[np.ndarray]:
+    """All numbers of devices and target."""
+    devices = {} if calibration is None else calibration.cameras
+    own = [(each.matrix, each.distortion, each.camera_from_world) for _, each in sorted(devices.items())]
+    return [circle_layout.lengths(target), *(numbers for one in own for numbers in one)]
 
 
 def filmed(
@@ -272,13 +288,19 @@ def tank(config: Config, capture: Path, held: Held, watch: ConsoleWatch) -> list
         raise InputError(f"{capture / MANIFEST}: expected probe, the path of the probe's calibration, found none; or give probe")
     if probe.uncertainty is None:
         watch.say("warning     probe: no covariance: an error of its calibration is taken for a bent bracket")
-    known = Known(in_water(probe, config), *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)))
+    placed = in_water(probe, config)
+    thermometer = in_water(replace(probe, uncertainty=None), config).uncertainty
+    known = Known(placed, *((lag.lag_s, lag.sigma_s) if lag else (0.0, UNKNOWN_LAG_S)), thermometer)
     lines = bottom_equations.lines_of(sweep.images(), sweep.times, sweep.size, config.top_px)
     found, lag_s = verdicts.of_bottom(lines, sweep.track, known, sweep.size, config.speed_mm_s, config.alarm_sigma)
     shown = int(np.isfinite(lines.pixels).all(axis=(1, 2)).sum())
     watch.say(f"bottom      in {shown} of {len(sweep.times)} B-scans, lag {1e3 * lag_s:.1f} ms")
     if shown < latency_step.MOSTLY * min(len(sweep.times), bottom_equations.MOST):
         watch.say(f"warning     {sweep.name}: most B-scans show no bottom: is it a sweep over a tank's?")
+    devices = numbers_of(calibration_files.of_capture(capture, config.calibration), target_of(config))
+    clock = None if lag is None else np.array([lag.lag_s])
+    against = check_log.digest(*devices, probe.target_from_image, probe.scale, clock)
+    found = [one._replace(against=against) for one in found]
     return found if lag else [one for one in found if one.part != bottom_equations.CLOCK] + [Verdict(parts[1], "unseen")]
 
 

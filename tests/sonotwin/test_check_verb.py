@@ -65,14 +65,18 @@ def test_a_log_within_the_folder_that_is_replaced_is_refused(bottom, tmp_path, c
     assert "expected a folder apart from what is read" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("lag", "status"), [("lag", 0), ("early", 1)])
-def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, status):
-    """By 20 ms, known to 1 ms. Straight up and down, the bracket stays open; what wasn't recorded is not checked."""
+def write_probe(path):
+    """A probe that looks down, known to 1 mrad and 0.05 mm."""
     names = ("rx", "ry", "rz", "tx", "ty", "tz")
     sigma = Uncertainty(names, np.diag(np.repeat([1e-3, 0.05], 3) ** 2))
     looking_down = rigid.transform([[1, 0, 0], [0, 0, -1], [0, 1, 0]], [0, 0, 0])
-    water = float(speed_of_sound(22.0))
-    probe_files.write(tmp_path / "probe.yaml", ProbeCalibration(looking_down, np.full(2, bscans.MM_PER_PX), sigma, water))
+    probe_files.write(path, ProbeCalibration(looking_down, np.full(2, bscans.MM_PER_PX), sigma, float(speed_of_sound(22.0))))
+
+
+@pytest.mark.parametrize(("lag", "status"), [("lag", 0), ("early", 1)])
+def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, status):
+    """By 20 ms, known to 1 ms. Straight up and down, the bracket stays open; what wasn't recorded is not checked."""
+    write_probe(tmp_path / "probe.yaml")
     files = [f"probe={tmp_path / 'probe.yaml'}", f"lag={bottom / f'{lag}.json'}", f"log={tmp_path / 'rig.jsonl'}"]
     assert main(["check", f"capture={bottom / 'capture'}", f"out={tmp_path / 'out'}", *files]) == status
     made = json.loads((tmp_path / "out/check.json").read_text())
@@ -80,8 +84,26 @@ def test_a_clock_that_is_off_is_told_and_logged(bottom, tmp_path, capsys, lag, s
     assert states["clock"] == ("moved" if status else "good") and states["cam1"] == "unseen"
     assert states["probe"] in ("open", "good")
     assert len((tmp_path / "rig.jsonl").read_text().splitlines()) == 1
+    assert made["parts"][5]["estimate"]["motion"][0] == pytest.approx(0.02 if status else 0.0, abs=3e-3)
     page, said = (tmp_path / "out/check.html").read_text(encoding="utf-8"), capsys.readouterr().out
     assert ("Run measure-lag." in page) == bool(status) == ("Moved: scanner's clock. Run measure-lag." in said)
+
+
+def test_a_clock_that_drifts_below_the_alarm_ends_with_status_1(bottom, tmp_path, capsys):
+    """Earlier checks found it 9 ms early, of a lag known to 5 ms and checks good to 1 ms."""
+    write_probe(tmp_path / "probe.yaml")
+    log = tmp_path / "rig.jsonl"
+    files = [f"probe={tmp_path / 'probe.yaml'}", f"lag={bottom / 'lag.json'}", f"log={log}"]
+    line = ["check", f"capture={bottom / 'capture'}", f"out={tmp_path / 'out'}", *files]
+    assert main(line) == 0 and "Out of control" not in capsys.readouterr().out
+    made = json.loads(log.read_text())
+    clock = made["parts"][5]["estimate"]
+    clock |= {"motion": [clock["motion"][0] - 9e-3], "own": [[1e-6]], "common": [[2.5e-5]]}
+    for day in range(2):
+        made["time"] = f"2026-05-0{day + 1}T08:00:00Z"
+        log.write_text(("" if day == 0 else log.read_text()) + json.dumps(made) + "\n")
+    assert main(line) == 1
+    assert "Out of control over the days: scanner's clock since 2026-05-02" in capsys.readouterr().out
 
 
 def test_poses_of_the_bottom_may_be_in_track_s_folder(bottom, tmp_path, capsys):

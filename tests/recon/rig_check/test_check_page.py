@@ -2,9 +2,11 @@
 
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
 
-from recon.rig_check import check_log, check_page
+from recon.rig_check import check_log, check_page, control_charts
+from recon.rig_check.fault_tests import Finding
 from recon.rig_check.verdicts import Verdict
 
 FIRST = datetime(2026, 5, 4, 8, 12, tzinfo=UTC)
@@ -72,3 +74,30 @@ def test_the_limit_stands_apart_from_the_deviation():
     assert second[:place].endswith("0.112 mm") and "19.3 σ    0.982 mm    0.112 mm" in second
     assert second.endswith("shifted by 0.06 mm (or camera 1)") and "±" not in head + first + second
     assert third.split() == ["probe", "on", "its", "bracket", "not", "checked"]
+
+
+def clocks(lags) -> list[check_log.Check]:
+    """A check a day of a clock that is known to 5 ms, by checks good to 1 ms."""
+    found = [
+        Finding(0.5, 1, np.array([lag]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[2.5e-5]]), False) for lag in lags
+    ]
+    verdicts = [Verdict("clock", "good", 0.5, 0.01, 0.02, finding=one) for one in found]
+    made = [check_log.check("x", [one]) for one in verdicts]
+    return [one.model_copy(update={"time": FIRST + timedelta(days=day)}) for day, one in enumerate(made)]
+
+
+def test_the_page_and_the_verdict_say_which_part_drifts_since_when_and_how_fast():
+    """A clock that errs by 4 ms all days, and one that gains 0.5 ms a day after ten days, 5 ms in all; both below the alarm."""
+    for lags, told in (([4e-3] * 20, False), ([4e-3] * 10 + [4e-3 + 5e-4 * day for day in range(11)], True)):
+        log = clocks(lags)
+        text, said = check_page.write_text(log[-1], log, 3.2), check_page.summary(log[-1], control_charts.charts(log, 3.2))
+        drift = "scanner's clock since 2026-05-14, evenly in 10 days: +5.0 ms. Run measure-lag."
+        assert (drift in said) == ("in 10 days" in text) == ("in control" not in text) == told
+        assert "Control charts" in text and text.count("<svg") == 3 and "have no motions" not in text
+
+
+def test_days_of_earlier_versions_are_said_to_be_missing_in_charts():
+    log = clocks([0.0] * 5)
+    old = [one.model_copy(update={"parts": (one.parts[0].model_copy(update={"estimate": None}),)}) for one in log[:2]]
+    assert "2 checks of the log have no motions" in check_page.write_text(log[-1], [*old, *log[2:]], 3.2)
+    assert "Control charts" not in check_page.write_text(old[-1], old, 3.2)

@@ -1,5 +1,7 @@
 """Parts that moved are found and named by their equations; errors that the calibration admits are no alarm."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,24 @@ def test_alarms_are_as_seldom_as_they_claim(equations, rng):
     """Beyond 2 sigma 4.6 % of 1000 checks, for each part, to 5 standard deviations of a count, with errors 30 times the noise."""
     sigmas = np.array([[one.sigma for one in fault_tests.find(measured(equations, rng), 50.0).values()] for _ in range(1000)])
     assert (sigmas > 2).mean(axis=0) == pytest.approx(0.0455, abs=5 * np.sqrt(0.0455 / 1000))
+
+
+def test_the_motion_found_varies_as_told_from_day_to_day_and_from_rig_to_rig(equations, rng):
+    """On 200 days of one rig, on each of which one more uncertain number is drawn anew, and of 200 rigs of other calibrations.
+
+    Whitened squares sum to six in the mean, to 5 standard deviations; the days' mean is the calibration's error.
+    """
+    day, error, found = rng.standard_normal((40, 1)), rng.standard_normal(3), {"days": [], "rigs": []}
+    for _ in range(200):
+        for name, errors in (("days", error), ("rigs", rng.standard_normal(3))):
+            residuals = rng.standard_normal(40) + equations.spread @ errors + day @ rng.standard_normal(1)
+            found[name].append(fault_tests.find(replace(equations, residuals=residuals, daily=day), 50.0)["first"])
+    one = found["days"][0]
+    for name, covariance in (("days", one.own), ("rigs", one.own + one.common)):
+        motions = np.array([each.motion for each in found[name]])
+        left = motions - (motions.mean(axis=0) if name == "days" else 0.0)
+        squares = np.einsum("ni,ni->n", left, np.linalg.solve(covariance, left.T).T)
+        assert squares.mean() == pytest.approx(6, abs=5 * np.sqrt(12 / 200))
 
 
 @pytest.mark.parametrize("part", ["first", "second"])

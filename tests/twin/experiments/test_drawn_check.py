@@ -1,15 +1,16 @@
 """Drawn rigs: what moved is named, what didn't isn't; an exact rig leaves no residual."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty, in_use
+from recon.model.calibration import Uncertainty, in_use, with_drift, with_scale
 from recon.model.probe import ProbeCalibration
 from recon.model.tracks import Track
-from recon.rig_check import optics_equations, verdicts
+from recon.rig_check import check_log, control_charts, drift, optics_equations, verdicts
 from recon.rig_check.bottom_equations import Known
 from recon.rig_check.verdicts import Optics
 from twin.experiments import drawn_check
@@ -61,6 +62,30 @@ def test_devices_that_moved_are_named(rig, calibration, known, rng, moved):
     if moved:
         worst = max(found, key=lambda one: one.mm)
         assert worst.part == moved and worst.mm > 0.2 and worst.mm_sigma < worst.mm
+
+
+@pytest.mark.slow
+def test_motions_vary_from_day_to_day_by_their_own_covariance(rig, calibration, rng):
+    """Six days of two rigs whose calibration errs by three times the usual drift, the target held otherwise on each.
+
+    Beside the mean of the days before, squares of 60 numbers a part are 1 in the mean, to five standard deviations; with the
+    mounts' usual drift left out, cameras' are 15.
+    """
+    cameras = calibration.cameras
+    fixed, daily = with_drift(with_scale(None, cameras, 3e-4), cameras, 0.15), drift.usual_drift(cameras, 0.05)
+    whole, squares = with_drift(fixed, cameras, 0.05), defaultdict(list)
+    for _ in range(2):
+        made, course = drawn_check.drawn_rig(cameras, fixed, rng), defaultdict(list)
+        for _ in range(6):
+            true = drawn_check.drawn_rig(made, daily, rng)
+            film = drawn_check.drawn_film(true, cameras, rig.target, 0.008, rng, 12)
+            seen = Optics(film, drawn_check.drawn_matches(true, cameras, (0, 1), 0.02, rng))
+            for one in verdicts.of_optics(seen, calibration, whole, rig.target, 20.0, daily):
+                course[one.part].append(check_log.entry(one).estimate)
+        for part in ("cam1", "cam2", "projector"):
+            squares[part].append(control_charts.innovations(course[part])[1:] ** 2)
+    for part, each in squares.items():
+        assert np.mean(each) == pytest.approx(1, abs=5 * np.sqrt(2 / 60)), part
 
 
 def test_without_fringes_a_cameras_turn_may_be_the_others(rig, calibration, known, rng):
