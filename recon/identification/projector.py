@@ -62,6 +62,7 @@ SHIFTS = 2  # among gains, offsets and shifts
 FAITHFUL = 1.2  # times the noise, which residuals of a faithful model reach at most
 FRINGES = 8  # images, that show frames' errors by themselves
 FEW = 1000  # pixels of a search
+AT_ONCE = 200  # pixels: slopes of more leave the cache, and of fewer the interpreter takes most of the time
 COARSE, FINE = Rules(damping=1e-2, converged=1e-5, steps=25), Rules(converged=1e-7, steps=8)
 ODD = 6.0  # times the median of the pixels' mean squares, from which on a pixel loses weight: an edge, a moving thread
 ROUNDS = 3  # of weights and of the frames' standard deviations
@@ -474,12 +475,12 @@ class Model:
         axes, table = tuple(self.pixels.along), mirrors_of(self.patterns, state.shared[GAMMA], state.frames[2], self.rounded_at)
         precision, off = self.precision, self.off_prior(state)
         size, own_size, count = len(off) + bend, 2 + len(self.pixels.along), self.pixels.images.shape[1]
-        normal, scores, squares, cost = np.zeros((size, size)), [], 0.0, 0.0
+        blocks, number = np.unique(self.pixels.block, return_inverse=True)
+        normal, block_right, squares, cost = np.zeros((size, size)), np.zeros((len(blocks), size)), 0.0, 0.0
         inner, crossed = np.empty((count, own_size, own_size)), np.empty((count, own_size, size))
         pulled, firm = np.empty((count, own_size)), np.zeros((count, own_size))
         firm[:, 2:] = np.stack([self.pixels.along[axis].loose ** -2 for axis in axes], axis=1)
-        for block in np.unique(self.pixels.block):
-            chosen = np.flatnonzero(self.pixels.block == block)
+        for chosen in np.array_split(np.argsort(number, kind="stable"), -(-count // AT_ONCE)):
             seen = self.see(state, table, chosen)
             albedo, ambient = self.shade(state, seen.light, chosen)
             bright = albedo * np.exp(state.frames[0])[:, None]
@@ -506,14 +507,13 @@ class Model:
             inner[chosen], crossed[chosen] = back @ mine, back @ slopes
             pulled[chosen] = (back @ rest.T[:, :, None])[..., 0] + firm[chosen] * drawn
             normal += flat.T @ flat
-            scores.append(flat.T @ rest.T.ravel())
+            np.add.at(block_right, number[chosen], np.einsum("pns,np->ps", slopes, rest))
             squares += float((rest**2).sum())
             cost += float((firm[chosen] * drawn**2).sum())
         inner[:, range(own_size), range(own_size)] += firm
         if bend:
             precision, off = np.pad(precision, (0, 1)), np.append(off, 0.0)
         cost += squares + float(off @ precision @ off)
-        block_right = np.array(scores)
         right = block_right.sum(axis=0) - precision @ off
         system = System(normal + precision, right, inner, crossed, pulled, axes, self.pixels.block, block_right)
         return system, cost, squares

@@ -48,7 +48,7 @@ Size = tuple[int, int]  # width, height, px
 MIN_FRAMES = 8  # also of a random start: eighteen unknowns, by three numbers a frame where there is one N-wire
 DRAWS = 100  # random frames; at 20 % outliers 0.8**8 = 17 % of them are clean
 REFINED = 3  # of these starts, the best
-REFINE = Rules(steps=8)  # of these, which need not converge
+REFINE = Rules(steps=8, converged=1e-4)  # of these, which need not converge
 ROUNDS = 20
 ARM_MM = 50.0  # of a registration: its standard deviation over this is that of its turns, as landmarks lie apart
 GATE = 13.8  # squared normalised residual of an outlier; exceeded by 1 of 1000 good dots (chi-square, 2)

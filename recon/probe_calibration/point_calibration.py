@@ -34,7 +34,7 @@ from recon import arguments
 from recon.errors import InputError
 from recon.estimation.covariance import inverse, propagate, whitening
 from recon.estimation.equations import NormalEquations, Step
-from recon.estimation.levenberg_marquardt import descend
+from recon.estimation.levenberg_marquardt import USUAL, Rules, descend
 from recon.estimation.parameters import Blocks
 from recon.geometry import rigid
 from recon.model.calibration import Uncertainty
@@ -54,6 +54,7 @@ NO_POSE = "the target was not tracked"
 MIN_FRAMES = 6
 DRAWS = 500  # random sixes of frames; at 30 % outliers 0.7**6 = 12 % of them are clean
 REFINED = 5  # of these starts, the best
+REFINE = Rules(steps=8, converged=1e-4)  # of these, which need not converge
 GATE = 16.27  # squared normalised residual of an outlier; exceeded by 1 of 1000 good frames (chi-square, 3)
 DRAWS_TRIED = 50  # of these, where many lags are tried
 MEDIAN = 2.366  # of chi-square with 3 degrees of freedom
@@ -519,10 +520,14 @@ def _normal_equations(estimate: _Estimate, sightings: Sightings, noise: Noise, w
     return equations.held(np.diag(known), departures), float(np.sum(left**2) + known @ departures**2)
 
 
-def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | float = 1.0) -> _Estimate:
+def _fit(start: _Estimate, sightings: Sightings, noise: Noise, weights: Array | float = 1.0, rules: Rules = USUAL) -> _Estimate:
     """Weighted least squares."""
     weights = np.broadcast_to(weights, len(sightings.pixels))
-    return descend(start, lambda estimate: _normal_equations(estimate, sightings, noise, weights), _Estimate.moved).estimate
+
+    def linearise(estimate: _Estimate) -> tuple[NormalEquations, float]:
+        return _normal_equations(estimate, sightings, noise, weights)
+
+    return descend(start, linearise, _Estimate.moved, rules=rules).estimate
 
 
 def _robust_start(
@@ -559,7 +564,7 @@ def _refined_on_half(start: _Estimate, sightings: Sightings, noise: Noise) -> _E
     keep = max(len(sightings.pixels) // 2 + 1, min(9, len(sightings.pixels)))
     for _ in range(2):
         chosen = np.argsort((_residuals(start, sightings) ** 2).sum(axis=1))[:keep]
-        start = _fit(start, sightings.of(chosen), noise)
+        start = _fit(start, sightings.of(chosen), noise, rules=REFINE)
     return start
 
 

@@ -1,8 +1,11 @@
 """`sonotwin identify`, from captures to a rig's file that other verbs take."""
 
+import contextlib
+import io
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,11 +17,12 @@ from recon.session import rig_step
 from sonotwin.choices import read, read_rig
 from sonotwin.cli import main
 from tests.recon.session import speckle_captures
-from tests.sonotwin.test_surface_verb import PROJECTOR, SEQUENCES, SIZE, optics, write_capture
+from tests.sonotwin.test_surface_verb import PROJECTOR, SEQUENCES, optics, write_capture
 from twin.ultrasound.transducer import Transducer
 
 __all__ = ["optics"]  # a fixture
 
+SIZE, CORNER = (48, 38), (136, 109)  # a part of the images: 1 500 pixels show what a projector does
 NARROW = tuple(f"{part}.image_size=[96,408]" for part in ("rig.probe", "ultrasound"))
 
 
@@ -26,7 +30,9 @@ NARROW = tuple(f"{part}.image_size=[96,408]" for part in ("rig.probe", "ultrasou
 def capture(optics, tmp_path_factory) -> Path:
     """A plane under eight steps of grey fringes without a gamma, and Gray code."""
     folder = tmp_path_factory.mktemp("identify") / "capture"
-    write_capture(folder, SEQUENCES["gray"], optics)
+    whole = optics.cameras["cam1"]
+    part = replace(whole, size=SIZE, matrix=whole.matrix - np.array([[0, 0, CORNER[0]], [0, 0, CORNER[1]], [0, 0, 0]]))
+    write_capture(folder, SEQUENCES["gray"], replace(optics, cameras=optics.cameras | {"cam1": part}))
     return folder
 
 
@@ -49,13 +55,21 @@ def frames(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def identified(capture, frames, tmp_path_factory) -> tuple[Path, str]:
+    """The result of capture and frames, and what was said."""
+    out = tmp_path_factory.mktemp("identified") / "ours"
+    given = [f"capture={capture}", f"dark={frames / 'dark'}", f"flat={frames / 'flat'}", f"out={out}"]
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        assert main(["identify", *given, "day=2026-05-04"]) == 0
+    return out, said.getvalue()
+
+
+def test_a_surface_gives_a_file_for_other_verbs(identified):
     """The black level, light without gamma, and the optics as the capture has them."""
-    given = [f"capture={capture}", f"dark={frames / 'dark'}", f"flat={frames / 'flat'}", f"out={tmp_path / 'ours'}"]
-    assert main(["identify", *given, "day=2026-05-04"]) == 0
-    said = capsys.readouterr().out
-    found = json.loads((tmp_path / "ours" / "identified.json").read_text())
-    rig = read_rig(tmp_path / "ours" / "rig.yaml")
+    out, said = identified
+    found = json.loads((out / "identified.json").read_text())
+    rig = read_rig(out / "rig.yaml")
     assert rig.cam1.optics.size == SIZE and rig.projector.optics.size == PROJECTOR
     assert rig.cam2 == read_rig().cam2
     assert (rig.version, rig.identified.capture, str(rig.identified.day)) == (1, "capture", "2026-05-04")
@@ -64,18 +78,17 @@ def test_a_surface_gives_a_file_for_other_verbs(capture, frames, tmp_path, capsy
         assert abs(rig.number(name) - true) < 4 * known.sigma and known.sigma < 0.1 * true, name
         assert found["estimates"][name]["source"] == known.source
     assert "measured    cam1.sensor: " in said and "unknown     cam1.sensor.quantum_efficiency: " in said
-    text = (tmp_path / "ours" / "rig.yaml").read_text()
+    text = (out / "rig.yaml").read_text()
     assert text.startswith("# A rig as last identified from capture") and "# not measured: " in text
-    conditions = (tmp_path / "ours" / "conditions.yaml").read_text()
+    conditions = (out / "conditions.yaml").read_text()
     assert re.search(r"\n  flicker: [0-9.]+  # ± [0-9.e-]+: ", conditions) and "tremor_mm: 0.0  # not measured: " in conditions
 
 
-def test_without_frames_what_they_show_is_unknown_and_files_of_others_stay(capture, tmp_path, capsys):
+def test_without_frames_what_they_show_is_unknown_and_files_of_others_stay(identified, capture, tmp_path, capsys):
     """In the place of an earlier result, but not of the version that it begins with."""
-    out = tmp_path / "ours"
-    for _ in range(2):
-        assert main(["identify", f"capture={capture}", f"out={out}"]) == 0
-        (out / "mine.txt").write_text("of a person")
+    out = shutil.copytree(identified[0], tmp_path / "ours")
+    (out / "mine.txt").write_text("of a person")
+    assert main(["identify", f"capture={capture}", f"out={out}"]) == 0
     capsys.readouterr()
     assert main(["identify", f"capture={capture}", f"rig={out / rig_step.RIG}", f"out={out}"]) == 2
     assert "found version 1, as of rig, which would be lost; give another folder" in capsys.readouterr().err
@@ -99,7 +112,7 @@ def test_what_is_no_capture_of_these_is_refused(capture, frames, tmp_path, capsy
         ([f"capture={tmp_path}"], "manifest.json"),
         ([f"capture={own}"], "own/dark: expected a folder with images in cam1, found none"),
         ([f"capture={capture}", f"dark={few.parent}"], "expected two images or more of one thing, found 1"),
-        ([f"capture={capture}", f"dark={other.parent}"], "expected 320x256"),
+        ([f"capture={capture}", f"dark={other.parent}"], f"expected {SIZE[0]}x{SIZE[1]}"),
         ([f"capture={capture}", f"flat={tmp_path / 'nothing'}"], "expected a folder with images in cam1, found nothing"),
         ([f"capture={capture}", "gain=-1"], "gain"),
         ([f"capture={capture}", "adc_bits=7"], "adc_bits"),

@@ -67,7 +67,7 @@ def photograph(patterns: Patterns, optics: Calibration, name: str = "cam1", worl
 def write_capture(folder: Path, patterns: Patterns, optics: Calibration) -> np.ndarray:
     """A capture of the plane under a sequence, whose images are returned."""
     images = photograph(patterns, optics)
-    devices = {"cam1": Device(size=SIZE, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
+    devices = {"cam1": Device(size=optics.cameras["cam1"].size, exposure_s=0.01), "projector": Device(size=PROJECTOR)}
     writer.write_surface(folder, {"cam1": images}, patterns, optics, devices)
     return images
 

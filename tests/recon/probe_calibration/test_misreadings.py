@@ -92,7 +92,15 @@ READ = {
 }
 
 
-@pytest.mark.parametrize("named", READ)
+ROWS_READ = (  # one of each sort of mistake: readings are told alike, and rows differ by what misfits
+    "poses in inches:",
+    "poses of target_from_world, the inverse:",
+    "poses of a quaternion that begins with w",
+    "B-scans late by 2 of the poses:",
+)
+
+
+@pytest.mark.parametrize(("frames", "named"), [*product([crossing], READ), *product([rows], ROWS_READ)], indirect=["frames"])
 def test_poses_that_mean_something_else_are_named(named, rig, frames):
     assert calibrate(rig, frames)
     assert f"; likely {named}" in refusal(rig, at(frames, READ[named](frames.poses)))
@@ -153,9 +161,9 @@ def few(rig, rng, count):
 
 
 def test_frames_of_both_sides_of_a_slip_are_no_calibration_though_most_agree(rig):
-    """By a scale that is wrong by a tenth or more, to noise, with the others as outliers: in 6 of these 40 without a check."""
-    refused = []
-    for count, seed in product((15, 20), range(20)):
+    """By a scale that is wrong by a tenth or more, to noise, with the others as outliers: in 5 of these 9 without a check."""
+    refused, count = [], 15
+    for seed in range(2, 20, 2):
         rng = np.random.default_rng([seed, count])
         seen, slip = few(rig, rng, count), rng.standard_normal((2, 3))
         way, axis = slip / np.linalg.norm(slip, axis=1, keepdims=True)
@@ -163,7 +171,7 @@ def test_frames_of_both_sides_of_a_slip_are_no_calibration_though_most_agree(rig
         late = (np.arange(count) >= count / 2)[:, None, None]
         slipped = np.where(late, seen.poses @ step, seen.poses)
         refused.append(refusal(rig, phantom_frames.of_pairs("drawn", bscans.SIZE, slipped, seen.pixels)))
-    assert sum("expected frames that agree, found" in each for each in refused) >= 5
+    assert sum("expected frames that agree, found" in each for each in refused) >= 4
 
 
 def test_the_two_sides_of_a_slip_are_named_where_frames_of_both_agree(rig):

@@ -13,7 +13,7 @@ from recon.model.calibration import Uncertainty
 from recon.target_calibration import target_bundle
 from tests.recon.target_calibration import target_pairs
 
-DRAWS, PAIRS = 20, 4
+DRAWS, PAIRS = 14, 4
 BUT_DIAMETER = [0, 1, 2, 4, 5, 6]  # of which the covariance has a bound
 
 

@@ -78,13 +78,13 @@ def test_drawn_masses_are_the_seeds_and_are_told():
 @pytest.fixture(scope="module")
 def drawn():
     """Drawn masses of some patients."""
-    configs = [patient.Config(**COARSE, seed=seed) for seed in range(16)]
+    configs = [patient.Config(**COARSE, seed=seed) for seed in range(10)]
     return [patient.draw_masses(one, patient.skin_of(one), np.random.default_rng([one.seed, 2])) for one in configs]
 
 
 def test_drawn_masses_lie_apart(drawn):
     """By 3 mm: spheres of their sizes, and so the bodies, but for half a millimetre by which one isn't about its middle."""
-    for seed, masses in enumerate(drawn):
+    for seed, masses in enumerate(drawn[:5]):
         streams = patient._streams(patient.Config(seed=seed))[2].spawn(len(masses))
         bodies = [patient._lying(one, rng) for one, rng in zip(masses, streams, strict=True)]
         for (one, body), (two, other) in combinations(zip(masses, bodies, strict=True), 2):

@@ -11,7 +11,7 @@ from twin.tracking.mesh_bank import build_bodies
 from twin.tracking.samples import draw
 from twin.tracking.target_truth import board_hulls, overlap
 
-RIG, COUNT, SEED = rig_of_three(), 200, 7
+RIG, COUNT, SEED = rig_of_three(), 120, 7
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_board_on_a_post_stands_on_the_table(takes, bank):
             heights.append(rigid.apply(into, place)[2] - stand.height_mm)
             tilts.append(rigid.rotate(into @ held.motion.world_from_target, stand.up))
             paths.append(np.linalg.norm(held.motion.shift_mm))
-    assert len(heights) > 100
+    assert len(heights) > COUNT / 2
     assert np.abs(heights).max() < 1e-6 and np.abs(np.array(tilts) - [0, 0, 1]).max() < 1e-9
     assert np.median(paths) < 0.1  # 0.3 px at most, along the image, at 1 m
     assert max(np.linalg.norm(take.others["needle"].motion.shift_mm) for take in takes) > 2

@@ -206,8 +206,18 @@ def shaded() -> tuple:
     return bank_of([bare_board(rig().target)], [Surroundings(parts, ())]), made
 
 
+@pytest.fixture(scope="module")
+def all_rays():
+    """Each fourth pixel of the shaded scene by 64 rays, for some seeds, in shares of white: (4, 256, 320)."""
+    bank, take = shaded()
+    v, u = np.mgrid[2:1024:4, 2:1280:4]
+    lanes = lanes_of(0, 0, u, v, 16, np.arange(u.size))
+    made = [render(bank, rig(), [take], lanes, 64, seed).radiance.reshape(u.shape) for seed in range(10, 14)]
+    return np.array(made) / white_radiance(take, rig())
+
+
 @pytest.mark.parametrize("of_a_film", [True, False])
-def test_a_frame_is_what_all_rays_would_make_of_it(of_a_film, monkeypatch):
+def test_a_frame_is_what_all_rays_would_make_of_it(of_a_film, all_rays, monkeypatch):
     """Blur and shadows against 64 rays in each fourth pixel, by both's scatter over seeds, and half a percent of white, which the
     averages over shadows cost; but for the still block's outlines, where they cost up to 4 %.
     """
@@ -216,11 +226,9 @@ def test_a_frame_is_what_all_rays_would_make_of_it(of_a_film, monkeypatch):
     own, white, quality = rig(), white_radiance(take, rig()), FilmQuality()
     stills = [render_still(bank, own, take, quality, seed) if of_a_film else None for seed in range(4)]
     frames = np.array([render_film(bank, own, [take], quality, seed, still)[0].views[0] for seed, still in enumerate(stills)])
-    v, u = np.mgrid[2:1024:4, 2:1280:4]
-    lanes = lanes_of(0, 0, u, v, 16, np.arange(u.size))
-    whole = np.array([render(bank, own, [take], lanes, 64, seed).radiance.reshape(u.shape) for seed in range(10, 14)]) / white
     frames = frames[:, 2::4, 2::4] / white
-    apart, variance = frames.mean(axis=0) - whole.mean(axis=0), (frames.var(axis=0, ddof=1) + whole.var(axis=0, ddof=1)) / 4
+    apart = frames.mean(axis=0) - all_rays.mean(axis=0)
+    variance = (frames.var(axis=0, ddof=1) + all_rays.var(axis=0, ddof=1)) / 4
 
     def tiles(image):
         return image.reshape(32, 8, 40, 8).sum(axis=(1, 3)) / 64

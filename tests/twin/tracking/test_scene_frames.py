@@ -12,7 +12,7 @@ from scenes.handheld.body_look import look_of
 from scenes.kinds import breast
 from scenes.scene_types import Material, Scene, Thing
 from scenes.solid_meshes import grid, slab
-from tests.twin.tracking.takes import facing, plain_take, ranges, rig, rig_of_three
+from tests.twin.tracking.takes import bare_board, facing, plain_take, ranges, rig, rig_of_three
 from twin.conditions import Motion as Errors
 from twin.shooting import FrameShooting, Quality
 from twin.tracking import scene_frames
@@ -42,6 +42,18 @@ def led(count: int = 3) -> list:
     return scene_frames.motions(poses, poses, poses)
 
 
+@pytest.fixture
+def no_hand(monkeypatch):
+    """The probe's board alone, where it isn't shown: a hand that covers no circle takes seconds to find."""
+    monkeypatch.setattr(scene_frames, "as_designed", lambda *_: bare_board(RIG.target))
+
+
+@pytest.fixture(scope="module")
+def bank():
+    return scene_frames.make_bank(staged(led(6)), RIG, 0)
+
+
+@pytest.mark.usefixtures("no_hand")
 def test_things_keep_their_reflectance():
     """In light that comes evenly from all around, radiance is in proportion to it, whatever the slot would have drawn."""
     bank = scene_frames.make_bank(staged(led()), RIG, 0)
@@ -67,11 +79,10 @@ def test_motions_are_those_of_the_poses_over_the_exposure():
 
 
 @pytest.mark.parametrize("light", ["room", "projector"])
-def test_one_light_and_one_exposure(light):
+def test_one_light_and_one_exposure(light, bank):
     """The target's white is as bright as asked for on the whole, by one light; triggers may be late, frame by frame."""
     shooting = FrameShooting(white_dn=80.0, light=light)
     motions = led(6)
-    bank = scene_frames.make_bank(staged(motions), RIG, 0)
     made = scene_frames.takes(staged(motions), bank, RIG, ranges(), shooting, 3, Errors(trigger_s=1e-4))
     assert np.mean([take.white_dn for take in made]) == pytest.approx(80.0)
     falls = [white_radiance(take, RIG) for take in made]
@@ -90,6 +101,7 @@ def test_the_chosen_body_covers_no_circle():
     assert scene_frames.uncovered(bank, made[0].body, RIG.target, eyes) > 0.99
 
 
+@pytest.mark.usefixtures("no_hand")
 def test_scene_and_bodies_move_with_the_patient():
     """The plate's edge between dark and pale, and the rings of a board on its post, are where one rigid step takes them."""
     rig, step = rig_of_three(), rigid.from_rotation_vector([0, 0, np.deg2rad(5)], [18, -60, 0])
