@@ -1,4 +1,4 @@
-"""The demonstration, whole: from a command to a report; small here, and at full size among the slow tests."""
+"""The demonstration, whole: from a command to a report; small here, and with its sweeps among the slow tests."""
 
 import html
 import json
@@ -25,6 +25,7 @@ from sonotwin.demonstration import Config
 from sonotwin.pipeline import Step
 from sonotwin.verbs import evaluate, film, reconstruct, render, sweep, track
 from sonotwin.verbs.demo import followed, looked_inside
+from tests.twin.small_rigs import half_as_fields
 from twin.evaluation import session_errors, sweep_errors, track_errors
 
 SMALL = (  # cameras at half their size: fringes of ten pixels a period
@@ -101,9 +102,14 @@ def test_the_tank_is_seen_by_the_scanner_of_the_sweep():
 
 
 @pytest.mark.slow
-def test_the_demonstration_is_as_good_as_the_noise_allows(tmp_path, capsys):
-    """Without errors of the laboratory: outside, inside, and the report of both; steps that are lost come back the same."""
-    fields = ["conditions=ideal", f"out={tmp_path / 'demo'}", f"board={tmp_path / 'board'}"]
+def test_the_demonstration_is_as_good_as_the_noise_allows(rig, tmp_path, capsys):
+    """Without errors of the laboratory: outside, inside, and the report of both; steps that are lost come back the same.
+
+    By cameras of half the size, by fewer B-scans and frames. A pixel's noise is that of a whole camera, the calibration's
+    twice as large: `make accuracy ONLY=session` has the bars of whole ones.
+    """
+    few = ["wires=20", "bottom_s=2.5", "clocks.camera_hz=12", "path.speed_mm_s=28"]
+    fields = ["conditions=ideal", *half_as_fields(rig), *few, f"out={tmp_path / 'demo'}", f"board={tmp_path / 'board'}"]
     assert main(["demo", *fields]) == 0
     demonstrated = load("demo", fields, Config)
     check_figures(demonstrated.out, capsys.readouterr().out.splitlines())
@@ -118,11 +124,11 @@ def check_figures(out: Path, printed: list[str]) -> None:
     # the surface's noise and the calibration's: a common shift of all points, of another size in each session
     noise = np.hypot(metrics["limit_rms_mm"], metrics["point_sigma_mm"])
     assert metrics["surface_interior_rms_mm"] < 1.1 * noise and metrics["point_error_rms_mm"] < 2.5 * metrics["point_sigma_mm"]
-    assert 0.01 < metrics["point_sigma_mm"] < 0.04  # by geometry: as of drawn points with a sighting's noise
+    assert 0.02 < metrics["point_sigma_mm"] < 0.08  # by geometry: as of drawn points with a sighting's noise, of such pixels
     assert metrics["shape_error_rms_mm"] < 0.1 * metrics["limit_rms_mm"]
     assert metrics["surface_rms_mm"] < 0.1  # better than the paper's planes
     assert metrics["coverage"] > 0.98 and metrics["gross_error_fraction"] < 1e-4
-    assert 0.9 < metrics["z_std"] < 2  # sigma is of noise alone, a third of one camera's: beside it the calibration's form shows
+    assert 0.9 < metrics["z_std"] < 3  # sigma is of noise alone, a third of one camera's: beside it the calibration's form shows
     assert (metrics["tumours_true"], metrics["tumours_found"], metrics["tumours_false"]) == (3, 3, 0)
     assert metrics["lag_low_ms"] - 2 < 50 < metrics["lag_high_ms"] + 2
     assert metrics["placement_rms_mm"] < 1
@@ -130,6 +136,7 @@ def check_figures(out: Path, printed: list[str]) -> None:
     assert metrics["track_shift_median_mm"] < 0.1 and metrics["track_within_bound"] > 0.8
     for k in range(3):
         assert metrics[f"tumour{k}_centre_error_mm"] < 1 and metrics[f"tumour{k}_inside"] == 1
+        assert metrics[f"tumour{k}_volume_mm3"] == pytest.approx(metrics[f"tumour{k}_true_volume_mm3"], rel=0.08)
     assert metrics["tumour0_dice"] > 0.85
     assert all(f"seconds_{name}" in metrics for name in ("render", "board", "wires", "bottom", "scan", "reconstruct", "evaluate"))
     said = ["measured", "accuracy", "calibrated", "probe", "lag", "tumours", "tracked", "coverage", "look"]

@@ -237,14 +237,13 @@ def test_a_single_b_scan_is_no_recording(tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fields", [
-    (),
     ("scene=patient", "ultrasound=clinic"),
     ("ultrasound=bright", "conditions=lifelike"),
     ("ultrasound.gel_mm=3", "path.tilt_deg=[14,0]"),  # one end of the array off the skin
 ])  # fmt: skip
 def test_b_scans_of_the_twin_are_found_on_the_screen(fields, tmp_path, capsys):
     """To the pixel, whatever the face's ringing, the skin and the contact are."""
-    stroke = ("path.start_mm=[4,-4]", "path.end_mm=[4,3.5]")
+    stroke = ("path.start_mm=[4,-4]", "path.end_mm=[4,3.5]", "path.speed_mm_s=20")
     assert main(["sweep", *stroke, *fields, f"out={tmp_path / 'sweep'}"]) == 0
     assert exported(tmp_path / "sweep" / "capture", tmp_path / "out") == 0
     said = capsys.readouterr().out

@@ -40,11 +40,11 @@ def test_a_trembling_hand_is_told_from_noise(rig):
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth(rig):
-    """Of 100 hands drawn at random: 90 to 98 of 100 numbers lie within 1.96 sigma, and of each of the four 88 or more."""
-    off = np.array([list(errors(rig, seed).values()) for seed in range(1000, 1100)])
+    """Of 60 hands drawn at random: 90 to 98.5 of 100 numbers lie within 1.96 sigma, and of each of the four 85 or more."""
+    off = np.array([list(errors(rig, seed).values()) for seed in range(1000, 1060)])
     inside = np.abs(off) < 1.96
-    assert 0.90 <= inside.mean() <= 0.98
-    assert (inside.mean(axis=0) >= 0.88).all()
+    assert 0.90 <= inside.mean() <= 0.985
+    assert (inside.mean(axis=0) >= 0.85).all()
 
 
 def test_a_calm_hand_has_no_tremor_beyond_the_noise(rig):
@@ -100,16 +100,16 @@ def test_jitter_of_triggers_shows_in_a_moving_target(rig):
 
 @pytest.mark.slow
 def test_intervals_of_jitter_hold_the_truth(rig):
-    """Of 100 triggers and noises of rays drawn at random 90 or more of each lie within 1.96 sigma, and not nearly all."""
+    """Of 60 triggers and noises of rays drawn at random 87 % or more of each lie within 1.96 sigma, and not nearly all."""
     off = []
-    for seed in range(2000, 2100):
+    for seed in range(2000, 2060):
         rng = np.random.default_rng(seed)
         hand = Hand(0.05, 0.05, rng.uniform(5e-5, 1e-3), rng.uniform(20, 50), rng.uniform(0.7, 1.6), count=60)
         known = jitter(rig, hand, seed).estimates
         pairs = (known[TRIGGER], hand.trigger_s), (known["tracker.rays_over_predicted"], hand.noise)
         off.append([(one.value - true) / one.sigma for one, true in pairs])
     inside = (np.abs(off) < 1.96).mean(axis=0)
-    assert (inside >= 0.90).all() and inside.mean() <= 0.985
+    assert (inside >= 0.87).all() and inside.mean() <= 0.99
 
 
 def test_a_brackets_giving_is_found_from_pairs_of_calibrations():

@@ -64,16 +64,16 @@ def test_dead_elements_are_columns_dark_in_all_images(usual, rng):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth():
-    """7 scanners: 95 % of intervals cover, of some 73 that aren't independent within a scanner; 86 % at least pass."""
+    """4 scanners: 95 % of intervals cover, of some 42 that aren't independent within a scanner; 83 % at least pass."""
     off: list[float] = []
-    for seed in range(7):
+    for seed in range(4):
         array, attenuation, rng = scanner_draws.drawn(seed)
         found = scanner.identify(
             scanner_draws.recorded(array, attenuation, seed), scanner_draws.sheet_of(array, attenuation, rng)
         )
         off += scanner_draws.deviations(found, array).values()
-    assert len(off) > 60
-    assert (np.abs(off) < 1.96).mean() > 0.86
+    assert len(off) > 34
+    assert (np.abs(off) < 1.96).mean() > 0.83
 
 
 @pytest.mark.slow

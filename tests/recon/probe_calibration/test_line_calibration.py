@@ -61,9 +61,9 @@ def test_any_bracket_and_scanner_will_do(rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("registered", [False, True])
 def test_errors_are_as_predicted(registered, probe, rng):
-    """Places of pixels over 25 calibrations, with wires beside their places: chi-square of 3, its mean within 4 sigma of 3."""
+    """Places of pixels over 15 calibrations, with wires beside their places: chi-square of 3, its mean within 4 sigma of 3."""
     squares = []
-    for _ in range(25):
+    for _ in range(15):
         poses = wire_rows.poses_over(probe, FCAL, SIZE, rng)
         beside = 0.1 * rng.standard_normal((9, 3))
         registration = None
@@ -75,7 +75,7 @@ def test_errors_are_as_predicted(registered, probe, rng):
         covariance = point_calibration.point_covariance(found.calibration, POINTS[:1])
         squares.append(away[0] @ np.linalg.solve(covariance[0], away[0]))
         assert 0.8 < found.noise_factor < 1.25
-    assert abs(np.mean(squares) - 3) < 4 * np.sqrt(6 / 25)
+    assert abs(np.mean(squares) - 3) < 4 * np.sqrt(6 / 15)
 
 
 def test_wrong_dots_are_left_out(probe, poses, rng):

@@ -22,9 +22,9 @@ def near(found, pixel, mm):
 @pytest.mark.slow
 @pytest.mark.parametrize("medium", ["water", "gelatin", "silicone"])
 def test_tips_are_found_to_a_quarter_of_a_millimetre(medium):
-    """Half of 24 needles at all angles within 0.2 mm, 95 % within 0.6 mm, with a covariance that has them: chi-square, 2."""
+    """Half of 16 needles at all angles within 0.2 mm, 95 % within 0.6 mm, with a covariance that has them: chi-square, 2."""
     rng, errors, squared = np.random.default_rng(3), [], []
-    for k in range(24):
+    for k in range(16):
         tip = np.array([rng.uniform(12, 28), rng.uniform(12, 40), 0.2 * rng.standard_normal()])
         wire = rod(tip, rng.uniform(5, 55), 0.5 * rng.standard_normal(), rng.choice([-1, 1]))
         found = needle_echo.find(image(medium, wire, seed=k))
@@ -32,7 +32,7 @@ def test_tips_are_found_to_a_quarter_of_a_millimetre(medium):
             off = found.pixel - echo_of(tip, medium)
             errors.append(np.linalg.norm(off * SCALE))
             squared.append(off @ np.linalg.solve(found.covariance, off))
-    assert len(errors) >= 20 and np.median(errors) < 0.2 and np.percentile(errors, 95) < 0.6
+    assert len(errors) >= 13 and np.median(errors) < 0.2 and np.percentile(errors, 95) < 0.6
     assert 0.3 < np.median(squared) < 2.8, "1.39 of two normal numbers"
 
 

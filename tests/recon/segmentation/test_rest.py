@@ -18,6 +18,7 @@ from recon.probe_calibration import sound_in_water
 from recon.segmentation import contact, rest, segmented_scans
 from recon.segmentation.blur_correction import Blur
 from recon.segmentation.rest import LIMITS, Rest
+from scenes.kinds import breast
 from scenes.solid_meshes import grid
 from twin.evaluation import sweep_errors
 from twin.experiments import mass_accuracy
@@ -152,10 +153,13 @@ def test_more_than_half_a_millimetre_left_is_said():
 def test_pressed_masses_are_found_as_they_rest(rig: Rig):
     """Silicone over a table, pressed by 2 mm and solved by finite elements; without the nipple, which tears at their limit.
 
-    Centres come to 0.8 mm of truth, volumes to 8 %, and squared errors are a few variances at most: chi-square of 9, 99.9 %.
+    The two smaller ones, by one stroke: centres come to 0.8 mm of truth, volumes to 8 %, and squared errors are a few variances
+    at most: chi-square of 6, 99.9 %.
     """
-    scene = {"kind": "breast", "nipple_height_mm": 1.5, "size_mm": [170.0, 130.0, 49.5]}
-    path = mass_accuracy.PATH.model_copy(update={"standoff_mm": -2.0})
+    smaller = [one.model_dump() for one in breast.Config().tumours[1:]]
+    scene = {"kind": "breast", "nipple_height_mm": 1.5, "size_mm": [170.0, 130.0, 49.5], "tumours": smaller}
+    one = {"start_mm": (22.0, -31.0), "end_mm": (22.0, 36.0), "strokes": 1}
+    path = mass_accuracy.PATH.model_copy(update=one | {"standoff_mm": -2.0})
     planned = plan_sweep(
         SweepSettings(
             rig=rig, scene=scene, ultrasound=Transducer(), path=path, living=Living(yields=True, element_mm=5.0), seed=3
@@ -168,12 +172,12 @@ def test_pressed_masses_are_found_as_they_rest(rig: Rig):
     probe = sound_in_water.for_tissue(probe, mass_accuracy.SOUND.tissue)
     placed = poses_at(plan.track, plan.times, clocks.lag_s) @ sequences.target_from_pixel(probe)
     scans = Scans(images[0].shape, placed, lambda: iter(images), probe.speed_m_s, 1540.0, probe, times_s=plan.times * 1e-9)
-    breast = next(thing.mesh for thing in planned.scene.things if thing.name == "breast")
-    found = segmented_scans.find_masses(scans, sweep_errors.facing(breast), blur=Blur(), overlays=0)
+    skin = next(thing.mesh for thing in planned.scene.things if thing.name == "breast")
+    found = segmented_scans.find_masses(scans, sweep_errors.facing(skin), blur=Blur(), overlays=0)
     pairs = sweep_errors.compare(list(found.meshes.values()), [thing for thing in planned.scene.things if thing.inside])
-    assert len(pairs) == len(found.meshes) == 3
+    assert len(pairs) == len(found.meshes) == 2
     errors = np.array([pair.centre_error_mm for pair in pairs])
     sigmas = np.array([found.figures[f"mass{pair.number}_centre_sigma_mm"] for pair in pairs])
-    assert errors.max() < 0.8 and np.sum((errors / sigmas) ** 2) < 28 / 3
+    assert errors.max() < 0.8 and np.sum((errors / sigmas) ** 2) < 22.5 / 3
     assert all(abs(pair.found.volume / pair.true.volume - 1) < 0.08 for pair in pairs if pair.found is not None)
     assert found.figures["pressed_mm"] == pytest.approx(2.0, abs=0.15)

@@ -20,7 +20,7 @@ from twin.living import elastic_body
 from twin.living import living_body as living_body_module
 from twin.living.living_body import Living, LivingBody, LivingSweep, breath, living_body, moved_scene, pulse, scenes_at
 from twin.optics.instruments import CameraOptics, ProjectorOptics
-from twin.optics.light_transport import Tracing, render
+from twin.optics.light_transport import Tracing, render_pixels
 from twin.optics.raster import Light
 from twin.optics.ray_world import build_world, reshape_things
 from twin.ultrasound.bscan import scan, scans
@@ -32,6 +32,7 @@ from twin.ultrasound.transducer import Transducer
 
 QUIET = {"noise_db": -200.0, "face_ring_mm": 0.0, "reverberations": 0, "tgc_db_per_cm_mhz": 0.0}
 CALM = Hand(shift_mm=0, turn_deg=0)
+HALF = 26  # px, of a window about a mark
 
 
 @pytest.fixture(scope="module")
@@ -175,27 +176,36 @@ def test_light_shows_marks_where_the_skin_has_carried_them(rig):
     cameras = [getattr(rig, name) for name in ("cam1", "cam2")]
     width, height = rig.projector.optics.size
     light = Light((width, height), ("columns",), (np.ones(width, np.float32),), 0.0)
-    world, found = build_world(scene), []
+    world, optics, found = build_world(scene), [CameraOptics.of(device) for device in cameras], []
     for there in (scene, moment):
         reshape_things(world, there)
-        places = []
-        for device in cameras:
-            image = render(world, CameraOptics.of(device), ProjectorOptics.of(rig.projector), light, Tracing(samples=16), 3)[0]
-            places.append(
-                [_dark_spot(image, device.optics.camera().project(there.things[0].mesh.vertices[[mark]])[0]) for mark in marks]
+        pixels = []
+        for its in optics:
+            near = np.rint(its.camera.project(there.things[0].mesh.vertices[marks])).astype(int)
+            image = np.zeros(its.camera.size[::-1], np.float32)
+            windows = np.concatenate([_window(image, place).ravel() for place in near]).astype(np.uint32)
+            values = render_pixels(
+                world, its, ProjectorOptics.of(rig.projector), light, Tracing(samples=16), 3, np.unique(windows)
             )
-        pixels = [np.array(each) for each in places]
+            image.ravel()[np.unique(windows)] = values[0]
+            pixels.append(np.array([_dark_spot(image, place) for place in near]))
         found.append(triangulated([one.optics.camera() for one in cameras], pixels, np.array([vertices[mark] for mark in marks])))
     truth = moment.things[0].mesh.vertices[marks] - vertices[marks]
     assert np.linalg.norm(truth, axis=1).min() > 1.0
     assert np.linalg.norm(found[1] - found[0] - truth, axis=1).max() < 0.01
 
 
-def _dark_spot(image, near, half=26):
+def _window(image, near):
+    """Numbers of the pixels about a place."""
+    rows, columns = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
+    return (rows + near[1]) * image.shape[1] + columns + near[0]
+
+
+def _dark_spot(image, near):
     """Centroid of a dark spot about a pixel, on bright skin whose shading is quadratic."""
-    u, v = np.rint(near).astype(int)
-    window = image[v - half : v + half + 1, u - half : u + half + 1].astype(float)
-    rows, columns = np.mgrid[-half : half + 1, -half : half + 1]
+    u, v = near
+    window = image.ravel()[_window(image, near)].astype(float)
+    rows, columns = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1]
     design = np.stack([np.ones_like(rows), rows, columns, rows**2, columns**2, rows * columns], axis=-1)
     around = np.hypot(rows, columns) > 20
     shading = design @ np.linalg.lstsq(design[around], window[around], rcond=None)[0]
@@ -223,7 +233,7 @@ def settings(rig, **changed):
 
 @pytest.fixture(scope="module")
 def pressed_sweep(rig):
-    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0, breathing_s=2.0)
+    living = Living(yields=True, breathing_mm=3.0, heartbeat_mm=0.3, drag_mm=1.0, breathing_s=2.0, element_mm=5.0)
     return plan_sweep(settings(rig, living=living, clocks={"scanner_hz": 4.0}))
 
 
