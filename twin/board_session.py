@@ -245,9 +245,11 @@ def pose_name(number: int) -> str:
 
 
 def is_finished(session: Session) -> bool:
-    """Whether the board of this session is there already, whole."""
+    """Whether the board of this session is there already, whole; other parts beside it don't count."""
     kept = session.truth.described / SETTINGS
-    return kept.is_file() and (session.capture / MANIFEST).is_file() and session.truth.settings() == session.settings
+    if not (kept.is_file() and (session.capture / MANIFEST).is_file() and session.truth.settings() == session.settings):
+        return False
+    return read_manifest(session.capture).board is not None
 
 
 def check_place(folder: Path) -> None:

@@ -221,6 +221,15 @@ def test_a_board_does_not_take_the_place_of_a_film(settings, tmp_path):
         board_session.missing_poses(Session(tmp_path, "board", DESCRIBED), settings)
 
 
+def test_a_surface_alone_is_no_board(session, tmp_path):
+    """Though the settings are the same, of which there are none; another part stands in the folder of the truth."""
+    assert board_session.is_finished(Session(session, "board", DESCRIBED))
+    devices = {"cam1": Device(size=(64, 48)), "projector": Device(size=PATTERNS.projector_size)}
+    with Session(tmp_path, "surface", {}).write({"name": "plane"}) as (capture, _):
+        capture.add_surface({"cam1": np.zeros((PATTERNS.count, 48, 64), np.uint8)}, PATTERNS, devices)
+    assert not board_session.is_finished(Session(tmp_path, "board", {}))
+
+
 @pytest.mark.slow
 def test_rendering_noise_at_edges_is_that_of_the_sensor(rig, settings):
     """In images of full size, pixels at the circles' edges differ between two seeds by about their shot noise, at the nearest.
