@@ -11,6 +11,7 @@ from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model import circle_layout
 from recon.model.rig import PROBE, CameraDevice, Lens, Rig, Sensor, Target
+from recon.tracking.circle_detector import FRAME
 from scenes.handheld.mesh_parts import SLOTS
 from twin.tracking.sampling_ranges import CameraRanges, DataRanges, LightRanges, PoseRanges, TargetRanges
 
@@ -163,7 +164,7 @@ def _cameras(ranges: CameraRanges, light: LightRanges, rig: Rig, rng: np.random.
     inward = np.arctan2(centre[0], meet)
     turn = Rotation.from_rotvec([0, -inward, 0]) * Rotation.from_rotvec(np.deg2rad(rng.normal(0, 1.0, 3)))
     cam2_from_world = rigid.invert(rigid.transform(turn.as_matrix(), centre))
-    focal = rng.uniform(*ranges.focal_px)
+    focal = rng.uniform(*ranges.focal_px) * (rig.cam1.optics.size[0] / FRAME[0])  # so that their views are as wide in any image
     lens = _lens(ranges, focal, rig.cam1.sensor.pixel_um, rng)
     dark_noise = rng.uniform(*light.dark_noise_e)
     made = []

@@ -28,7 +28,7 @@ class CameraRanges(Ranges):
     """Ranges of calibrations, from rig to rig."""
 
     own_share: Share  # of samples with the rig's own cameras, exactly
-    focal_px: Lengths
+    focal_px: Lengths  # in images as wide as those that the networks know; in others in proportion
     centre_px: NotNegative  # standard deviation of the principal point from the image's middle
     distortion: NotNegative  # scale of k1; the rest follows
     baseline_mm: Lengths

@@ -8,6 +8,7 @@ import pytest
 
 from recon.geometry import rigid
 from recon.model.circle_layout import circle_centres
+from tests.twin.small_rigs import half
 from tests.twin.tracking.takes import ranges, rig, rig_of_three
 from twin.tracking.mesh_bank import build_bodies, uncovered_share
 from twin.tracking.samples import draw, facing
@@ -40,6 +41,22 @@ def test_a_take_depends_on_seed_and_number_alone(takes):
     assert again.noise_seed == takes[11].noise_seed
     assert (again.motion.world_from_target == takes[11].motion.world_from_target).all()
     assert draw(ranges(), RIG, 8, 11).noise_seed != again.noise_seed
+
+
+def test_foreign_cameras_see_as_much_whatever_the_rigs_pixels():
+    """Focal lengths over the image's width are the same for a rig of half as many pixels; of the usual rig they are as asked."""
+    asked = ranges()
+    foreign = asked.model_copy(update={"cameras": asked.cameras.model_copy(update={"own_share": 0.0})})
+    usual, small = (
+        np.array(
+            [device.optics.focal_px[0] / device.optics.size[0] for k in range(20) for device in draw(foreign, one, 3, k).cameras]
+        )
+        for one in (RIG, half(RIG))
+    )
+    assert RIG.cam1.optics.size[0] == 1280 == 2 * half(RIG).cam1.optics.size[0]
+    np.testing.assert_allclose(small, usual, rtol=1e-12)
+    least, most = asked.cameras.focal_px
+    assert 0.995 * least < 1280 * usual.min() < 1.2 * least and 0.8 * most < 1280 * usual.max() < 1.005 * most
 
 
 def test_targets_face_both_cameras_and_mostly_lie_in_their_images(takes):
