@@ -33,7 +33,7 @@ def apply(rig: Rig, findings: Findings) -> Rig:
     content = rig.model_dump(mode="json")
     numbers = {name: value for name, value in findings.estimates.items() if name.partition(".")[0] in Rig.model_fields}
     for name, estimate in numbers.items():
-        put(content, name, estimate.value)
+        put(content, name, estimate.value, "rig")
     for camera in ("cam1", "cam2"):
         if f"{camera}.optics.focal_px.0" in numbers:
             device = content[camera]
@@ -51,8 +51,8 @@ def next_version(rig: Rig, capture: str, day: date) -> Rig:
     return rig.model_copy(update={"version": rig.version + 1, "identified": Identified(day=day, capture=capture)})
 
 
-def put(content: Any, name: str, value: float) -> None:
-    """Put a number into nested maps and lists by its dotted name; InputError if there is none of that name."""
+def put(content: Any, name: str, value: float, described: str) -> None:
+    """Put a number into nested maps and lists by its dotted name; InputError, of what is described, if there is none."""
     *parents, last = name.split(".")
     try:
         for key in parents:
@@ -60,7 +60,7 @@ def put(content: Any, name: str, value: float) -> None:
         key = int(last) if isinstance(content, list) else last
         content[key] = round(value) if isinstance(content[key] + 0, int) else value
     except (KeyError, IndexError, ValueError, TypeError):
-        raise InputError(f"rig: expected a number of the rig, found {name}") from None
+        raise InputError(f"{described}: expected the name of one of its numbers, found {name}") from None
 
 
 def write(path: Path, rig: Rig, unknown: Mapping[str, str], heading: str) -> None:

@@ -129,7 +129,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     for line in describe(found):
         watch.say(line)
     name = manifest.name_of(settings.capture)
-    if any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
+    if rig != settings.rig or any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
         rig = rig_file.next_version(rig, name, settings.day or manifest.newest_day or _day(settings.capture / MANIFEST))
     heading = "\n".join(
         (
@@ -425,7 +425,7 @@ def _conditions(before: Part | None, found: Findings) -> Part:
     content = before.model_dump(mode="json")
     for name, one in found.estimates.items():
         if name.startswith(GROUP):
-            rig_file.put(content, name.removeprefix(GROUP), one.value)
+            rig_file.put(content, name.removeprefix(GROUP), one.value, "conditions")
     try:
         return type(before).model_validate(content)
     except ValidationError as error:

@@ -150,7 +150,7 @@ def described(settings: Fields, base: Mapping[str, Any], rig: Rig, found: Findin
         content["frequency_mhz"] = settings.frequency_mhz
     for name, one in found.estimates.items():
         if name.startswith(GROUP):
-            rig_file.put(content, name.removeprefix(GROUP), one.value)
+            rig_file.put(content, name.removeprefix(GROUP), one.value, "ultrasound")
     try:
         return type(settings.ultrasound).model_validate(content).model_dump(mode="json")
     except ValidationError as error:

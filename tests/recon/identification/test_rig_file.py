@@ -76,7 +76,7 @@ def test_a_damaged_covariance_is_refused(rig):
 def test_what_can_not_be_is_refused_by_name(rig):
     for name, value, told in (
         ("cam1.sensor.prnu", -0.5, "prnu"),
-        ("cam1.sensor.colour", 1.0, "cam1.sensor.colour"),
+        ("cam1.sensor.colour", 1.0, "^rig: expected the name of one of its numbers, found cam1.sensor.colour$"),
         ("cam1.optics.focal_px.2", 1.0, "cam1.optics.focal_px.2"),
         ("cam1.lens", 1.0, "lens"),
     ):

@@ -112,11 +112,13 @@ def test_unlike_captures_one_after_another_lose_nothing(surface, session, made, 
     second = identify(session, tmp_path / "second", *before(first), "tissue=tissue", SCALE)
     with_scanner = read_rig(second / "rig.yaml")
     assert with_scanner.probe.image_size == speckle_captures.SIZE != rig.probe.image_size
+    assert with_scanner.version == 2  # of which nothing but the probe's image is new
     array = f"ultrasound={second / 'ultrasound.yaml'}"
     assert read("ultrasound", second / "ultrasound.yaml")["dynamic_range_db"] == 61.3
     third = identify(session, tmp_path / "third", *before(second), array, "hand=[hand]")
     last = read_rig(third / "rig.yaml")
-    assert last == with_scanner == rig.model_copy(update={"probe": with_scanner.probe})
+    new = {name: getattr(with_scanner, name) for name in ("probe", "version", "identified")}
+    assert last == with_scanner == rig.model_copy(update=new)  # a film of the hand changes no rig
     assert last.measured["cam1.sensor.black_level_dn"].sigma == pytest.approx(BLACK.sigma)
     assert last.measured["cam1.sensor.black_level_dn"].source == BLACK.source and last.cam1.sensor.black_level_dn == BLACK.value
     assert conditions_of(second).frames.flicker == conditions_of(third).frames.flicker == FLICKER.value
@@ -124,7 +126,7 @@ def test_unlike_captures_one_after_another_lose_nothing(surface, session, made, 
     assert not (third / "ultrasound.yaml").exists()  # of which nothing was measured: the second one stays in use
     again = identify(surface, tmp_path / "again", *before(third), "day=2026-04-05")
     renewed = read_rig(again / "rig.yaml")
-    assert (renewed.version, str(renewed.identified.day)) == (2, "2026-04-05")
+    assert (renewed.version, str(renewed.identified.day)) == (3, "2026-04-05")
     assert renewed.probe == last.probe and renewed.measured == last.measured
     assert conditions_of(again) == conditions_of(third)
 
@@ -149,6 +151,14 @@ def test_conditions_that_cannot_be_are_refused(surface, made, tmp_path, capsys, 
     assert main(["identify", f"capture={surface}", f"out={tmp_path / 'ours'}"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "conditions: as measured, they can't be: frames.flicker" in line and not (tmp_path / "ours").exists()
+
+
+def test_a_number_that_conditions_do_not_have_is_named_as_theirs(surface, made, tmp_path, capsys, monkeypatch):
+    unknown = Findings({"conditions.frames.colour": Estimate(0.4, 0.1, "fringes")})
+    monkeypatch.setattr(rig_step.projector, "identify", lambda *_, **__: unknown)
+    assert main(["identify", f"capture={surface}", f"out={tmp_path / 'ours'}"]) == 2
+    told = "conditions: expected the name of one of its numbers, found frames.colour"
+    assert told in capsys.readouterr().err and not (tmp_path / "ours").exists()
 
 
 def test_the_day_is_that_on_which_the_newest_part_was_recorded(surface, made, tmp_path):

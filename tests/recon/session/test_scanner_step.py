@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from recon.capture import sweep_tables
 from recon.capture.manifest import read_manifest
+from recon.errors import InputError
 from recon.geometry import rigid
-from recon.identification.estimates import Findings
+from recon.identification.estimates import Estimate, Findings
 from recon.session import scanner_step
 from sonotwin import choices
 from tests.recon.session import speckle_captures
@@ -75,6 +76,13 @@ def test_the_description_has_the_recorded_image_and_what_was_measured(found, tmp
     one = found.findings.estimates["ultrasound.dynamic_range_db"]
     assert abs(ours.dynamic_range_db - one.value) < 0.1 * one.sigma and ours.elevation_mm == Transducer().elevation_mm
     assert "# ± " in text and "elevation_mm: 4.5  # not measured: no B-scans of even tissue side by side" in text
+
+
+def test_a_number_that_the_scanner_does_not_have_is_named_as_its(found):
+    settings = scanner_step.Fields(ultrasound=Transducer())
+    wrong = Findings({"ultrasound.colour": Estimate(1.0, 0.1, "B-scans")})
+    with pytest.raises(InputError, match=r"^ultrasound: expected the name of one of its numbers, found colour$"):
+        scanner_step.described(settings, Transducer().model_dump(mode="json"), found.rig, wrong)
 
 
 def test_dropped_b_scans_leave_the_rate(capture, tmp_path, monkeypatch):
