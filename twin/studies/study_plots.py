@@ -25,6 +25,7 @@ WIDE = 1.5  # ratio of the largest to the smallest step between values, above wh
 LETTERS = 38  # in a line beside an axis
 CROWDED = 60  # letters below an axis, above which its words stand upright
 ASIDE = 0.14  # of the distance between words on an axis: that between courses over one of them
+ABOVE = 1.1  # end of an axis from zero, over its largest figure: no marker lies on the edge
 TALL = 8.0  # ratio of the largest to the smallest figure, likewise
 
 
@@ -58,7 +59,7 @@ def draw(
     """Draw a figure over a factor.
 
     Few values of another factor get a line each; a factor with many values, as of a space-filling design, is a cloud of points.
-    Between values that are words there is no line.
+    Between values that are words there is no line, and at a single number nothing to draw one along.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def draw(
     else:
         other = other_factor(table, field, fields)
         found, held = courses(table, figure, field, other), courses(table, limit, field, other) if limit else []
-        if numeric(values):
+        if len(values) > 1 and numeric(values):
             _along(axes, np.array(values, float), found, held, kind)
         else:
             _beside(axes, [short(value) for value in values], found, held, kind)
@@ -177,7 +178,7 @@ def scale_heights(axes: Axes) -> None:
     if known.size and known.min() > 0 and known.max() > TALL * known.min():
         axes.set_yscale("log")
     elif known.size and known.min() >= 0:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0.0, max(axes.get_ylim()[1], ABOVE * known.max()))
 
 
 def short(value: Any) -> str:

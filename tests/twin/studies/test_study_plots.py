@@ -99,6 +99,18 @@ def test_no_marker_is_cut_off():
     assert axes.get_xlim() == (-0.5, 1.5)
 
 
+def test_a_single_point_stands_clear_of_the_edges():
+    """With what it is held against, and with its value below it; likewise values that are nearly the same."""
+    (axes,) = study_plots.draw(table((6, "a", 0, 0.3, 0.2)), "error_mm", "pitch", ["pitch"], "limit_mm").axes
+    point, held = axes.get_lines()
+    assert axes.get_ylim()[0] == 0 and axes.get_ylim()[1] >= 0.33
+    assert held.get_xydata().tolist() == [[0, 0.2]] and held.get_marker() == "_" and point.get_xydata().tolist() == [[0, 0.3]]
+    assert [text.get_text() for text in axes.get_xticklabels()] == ["6"]
+    alike = table((6, "a", 0, 0.3, NAN), (12, "a", 0, 0.301, NAN), (18, "a", 0, 0.3, NAN))
+    (axes,) = study_plots.draw(alike, "error_mm", "pitch", ["pitch"], "").axes
+    assert axes.get_ylim()[0] == 0 and axes.get_ylim()[1] >= 0.33
+
+
 def test_one_seed_has_no_median():
     rows = table((6, "a", 0, 2.0, 1.0), (12, "a", 0, 3.0, 1.0))
     (axes,) = study_plots.draw(rows, "error_mm", "pitch", ["pitch"], "").axes
