@@ -1,12 +1,13 @@
 """The log grows by whole lines; what is damaged is named, and left alone."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from recon.errors import InputError
-from recon.rig_check import check_log
+from recon.rig_check import check_log, control_charts
 from recon.rig_check.fault_tests import Finding
 from recon.rig_check.verdicts import Verdict
 
@@ -24,6 +25,25 @@ def test_checks_are_read_as_they_were_added(tmp_path):
     assert both == made and [one.name for one in both] == ["monday", "tuesday"]
     assert both[1].parts[1].rivals == ("cam1",) and both[1].parts[2].sigma is None
     assert len(log.read_text().splitlines()) == 2 and [path.name for path in log.parent.iterdir()] == ["rig.jsonl"]
+
+
+def test_a_log_of_earlier_versions_is_read_and_added_to(tmp_path):
+    """Kept as written: a line by the first check, and one with a rig's numbers, both before motions were logged."""
+    log = tmp_path / "rig.jsonl"
+    log.write_bytes(Path(__file__).with_name("log_before_0_2_0.jsonl").read_bytes())
+    monday, tuesday = check_log.read(log)
+    assert (monday.name, tuesday.name, monday.time.day) == ("monday", "tuesday", 30) and monday.parts == tuesday.parts
+    assert [(part.part, part.state, part.sigma) for part in monday.parts] == [
+        ("cam1", "maybe", 3.0),
+        ("cam2", "moved", 19.3),
+        ("clock", "good", 0.5),
+        ("probe", "unseen", None),
+    ]
+    assert monday.parts[1].rivals == ("cam1",) and not any(part.estimate for part in monday.parts)
+    assert monday.rig is None and [one.name for one in tuesday.rig.changed] == ["cam1.lens.focus_mm"]
+    assert tuesday.rig.before.text == "version 1 (2026-11-28, friday)"
+    check_log.add(log, check_log.check("today", SEEN))
+    assert check_log.read(log)[:2] == [monday, tuesday] and control_charts.charts(check_log.read(log), 3.2) == []
 
 
 ESTIMATE = {"motion": [1e-3], "own": [[1e-6]], "common": [[4e-6]], "against": "x"}
