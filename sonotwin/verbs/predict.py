@@ -3,6 +3,8 @@
 Reads a rig, such as rig=ours/rig.yaml of `sonotwin identify`, with patterns, a plate and settings of light and exposure; renders
 nothing. Says the RMS distance of points from their plane, with the interval that the rig's measured numbers leave; by how many
 per cent it changes for one per cent of each number of the rig, where it does: -1 is an error that halves when the number doubles.
+Numbers that weren't measured count as exact, and are named: flux, quantum efficiency and pixels' sizes, with them nominal focal
+lengths, of which `identify` measures none, and often others. The projector's light counts as a power of its values.
 `changes` are other values of any fields, each with its price: they are tried one by one, the most error saved for the money
 first. Takes some seconds.
 
@@ -42,7 +44,7 @@ from twin.ultrasound.transducer import Transducer
 TOLD = 0.02  # relative change of the error by that of a number: less isn't told
 NUMBERS = (
     *(f"cam1.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
-    *(f"cam1.sensor.{name}" for name in ("saturation_e", "dark_noise_e", "black_level_dn")),
+    *(f"cam1.sensor.{name}" for name in ("saturation_e", "dark_noise_e", "black_level_dn", "quantum_efficiency")),
     *(f"projector.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
     *(f"projector.{name}" for name in ("radiant_flux_w", "gamma", "contrast")),
 )
@@ -104,7 +106,8 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
             yield f"predicted   {predicted_session.FIGURES[figure]} {one.rms:.3f} ± {1.96 * one.sigma:.2g} mm RMS (95 %) {of}"
     for name, slope in predicted_plane.elasticities(rig, measurement_of(config), NUMBERS).items():
         if abs(slope) >= TOLD:
-            yield f"depends     {name} {rig.number(name):g}: {slope:+.2f} % a per cent"
+            sigma = f"± {rig.measured[name].sigma:.2g}" if name in rig.measured else "taken as exact"
+            yield f"depends     {name} {rig.number(name):g} ({sigma}): {slope:+.2f} % a per cent"
     saved = {
         name: (found.rms_mm - predicted_plane.predict(other.rig, measurement_of(other)).rms_mm, config.changes[name])
         for name, other in changed.items()

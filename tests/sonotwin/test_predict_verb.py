@@ -27,6 +27,18 @@ def test_measured_numbers_give_an_interval(tmp_path, capsys):
     assert "none of the rig's numbers was measured" in capsys.readouterr().out, "as it was given by hand"
 
 
+def test_numbers_that_were_not_measured_are_named_as_exact(tmp_path, capsys):
+    """With the exposure given, flux and quantum efficiency count, about alike: of both, images show the product."""
+    rig = rig_file.apply(read_rig(), Findings({"cam1.sensor.dark_noise_e": Estimate(11.0, 0.3, "a test")}))
+    rig_file.write(tmp_path / "ours.yaml", rig, {}, "a test")
+    assert main(["predict", f"rig={tmp_path / 'ours.yaml'}", "shooting.exposure_s=0.005"]) == 0
+    depends = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("depends")]
+    known = {name: " ".join(words) for _, name, _, *words in depends}
+    assert known["cam1.sensor.dark_noise_e"].startswith("(± 0.3): +")
+    for name in ("projector.radiant_flux_w", "cam1.sensor.quantum_efficiency"):
+        assert known[name].startswith("(taken as exact): -0.6"), name
+
+
 def test_sessions_tell_errors_of_points_b_scans_and_masses(capsys):
     assert main(["predict", "conditions=lifelike", "poses=demo", "sessions=2"]) == 0
     said = capsys.readouterr().out.splitlines()
