@@ -26,7 +26,7 @@ class RawLimits:
     """When noise isn't that of raw images."""
 
     sure: float = 5.0  # standard deviations, by the scatter of tiles
-    parts: int = 4  # of the tiles by level, in all of which it must be so
+    parts: int = 4  # of patterns' tiles by level, in all of which neighbours must be so, half as surely
     of_flats: float = 0.02  # correlation of neighbours
     of_patterns: float = 0.03  # the same
     blocks: float = 0.03  # of it, that ends at borders of blocks
@@ -55,13 +55,13 @@ def describe_processing(noise: TileNoise, line: PhotonTransfer | None, *, by_fla
     seen = noise.variance - ROUNDING > TRANSFER.dithered_dn**2
     if np.count_nonzero(seen) < TRANSFER.tiles:
         return None
-    parts = np.array_split(noise.beside[seen][np.argsort(noise.level[seen])], LIMITS.parts)
+    parts = np.array_split(noise.beside[seen][np.argsort(noise.level[seen])], 1 if by_flats else LIMITS.parts)
     along = [_least([part[:, k] - part[:, 4] for part in parts]) for k in range(3)]
     most = max(along, key=abs)
     if abs(most) > (LIMITS.of_flats if by_flats else LIMITS.of_patterns):
         blocks = _least([part[:, :2].mean(axis=1) - part[:, 3] for part in parts]) > LIMITS.blocks
         if most < 0:
-            return f"noise of neighbouring pixels is opposed (correlation {most:.2f}), as by sharpening or JPEG: {SET}"
+            return f"noise of neighbouring pixels is opposed (correlation {most:.2f}), as by sharpening, denoising or JPEG: {SET}"
         cause = "JPEG" if blocks else "demosaiced colours, denoising, JPEG, upscaling" + ("" if by_flats else " or a gamma")
         return f"noise of neighbouring pixels is alike (correlation {most:.2f}), as by {cause}: {SET}"
     if line is not None and _without_rise(line):
@@ -92,7 +92,7 @@ def _least(parts: Sequence[Array]) -> float:
     """
     means = np.array([part.mean() for part in parts])
     sigmas = np.array([part.std(ddof=1) / np.sqrt(len(part)) for part in parts])
-    alike = np.abs(np.sign(means).sum()) == len(parts) and (np.abs(means) > LIMITS.sure * sigmas).all()
+    alike = np.abs(np.sign(means).sum()) == len(parts) and (np.abs(means) > LIMITS.sure / np.sqrt(len(parts)) * sigmas).all()
     return float(means[np.abs(means).argmin()]) if alike else 0.0
 
 

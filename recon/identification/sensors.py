@@ -141,7 +141,8 @@ def identify_sensor(
     }
     if line is None:
         patterns = "eight steps of fringes, three sets of fewer, or a code with its inverses"
-        why = f"needs flat frames, or {patterns}, with a noise of 0.6 DN or more, at several levels or with dark frames"
+        noise = "a noise of 0.6 DN or more (JPEG and denoising leave less)"
+        why = f"needs flat frames, or {patterns}, with {noise}, at several levels or with dark frames"
         unknown |= dict.fromkeys((n + "saturation_e", n + "prnu"), why)
     found = Findings({}, unknown)
     stacks = sorted(dark, key=lambda stack: stack.exposure_s or 0.0)
