@@ -293,6 +293,8 @@ def _files(camera: str, settings: Settings, manifest: Manifest) -> Iterator[Path
     """Image files by which a camera's sensor is measured."""
     if manifest.surface is not None:
         yield from map(Path, manifest.surface.images.get(camera, ()))
+    elif manifest.board is not None:
+        yield from (Path(path) for pose in manifest.board.poses for path in pose.fringes.get(camera, ()))
     for folder in (settings.dark, settings.flat):
         if folder is not None:
             yield from (folder / camera).rglob("*.*")
