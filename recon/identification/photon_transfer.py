@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 ROUNDING = 1 / 12  # DN^2, of whole numbers
 TILE = 16  # px, side of a tile: small against the lighting, and 256 pixels know their variance to 9 % from one pair of frames
 AROUND = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.float32)
+FAR = 4  # px, farther than filters of cameras reach
 ROUNDS = 4  # of weights by the line that was fitted with the last ones
 
 
@@ -49,6 +50,10 @@ class TileNoise(NamedTuple):
     level: Array  # (t,) DN, mean over pixels and frames, by their shares of the variance
     variance: Array  # (t,) DN^2, of one frame, rounding included
     freedom: Array  # (t,) degrees of freedom
+    beside: (
+        Array  # (t, 5) correlation of pixels' noise with that of the next along rows, columns, diagonals, of the next across the
+    )
+    # borders of blocks of 8 px, and of those 4 px away; 0 in the mean over tiles if the noise is white
 
 
 @dataclass(frozen=True)
@@ -93,17 +98,19 @@ def noise_of_flat(frames: NDArray, bits: int) -> TileNoise:
     n, full = len(frames), 2**bits - 1
     mean = in_tiles(frames.mean(axis=0, dtype=np.float64))
     level, spread = mean.mean(axis=1), mean.std(axis=1)
-    power = np.zeros(len(level))
+    power, pairs = np.zeros(len(level)), np.zeros((len(level), 5))
     for frame in frames:
         off = in_tiles(frame) - mean
         flicker = off.mean() / max(level.mean(), 1.0)
         off -= off.mean(axis=1, keepdims=True) + flicker * (mean - level[:, None])
         power += (off**2).sum(axis=1)
+        pairs += _of_pairs(off)
     freedom = (n - 1) * (TILE**2 - 1)
     variance = power / freedom
     to_ends = LIMITS.margin * np.sqrt(variance + spread**2)
     usable = (level - to_ends > 0) & (level + to_ends < full)
-    return TileNoise(level[usable], variance[usable], np.full(np.count_nonzero(usable), float(freedom)))
+    beside = _correlation(pairs, variance * (n - 1), np.full((1, TILE**2, 1), 1 / TILE))
+    return TileNoise(level[usable], variance[usable], np.full(np.count_nonzero(usable), float(freedom)), beside[usable])
 
 
 def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoise | None:
@@ -210,7 +217,10 @@ def noise_of_inverses(images: NDArray, bits: int) -> TileNoise:
             left[k] = _beside(sums[k] - scene, shapes)
         scene = scene + left.mean(axis=0)
     freedom = np.full(len(scene), (len(sums) - 1.0) * (TILE**2 - 3))
-    return TileNoise(scene.mean(axis=1) / 2, (left**2).sum(axis=(0, 2), dtype=float) / freedom / 2, freedom)
+    variance = (left**2).sum(axis=(0, 2), dtype=float) / freedom  # of a sum
+    shapes = np.stack([np.ones_like(scene), scene, scene * lit[-1]], axis=2)
+    beside = _correlation(sum(map(_of_pairs, left)), variance * (len(sums) - 1), _orthonormal(shapes))
+    return TileNoise(scene.mean(axis=1) / 2, variance / 2, freedom, beside)
 
 
 def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int) -> TileNoise:
@@ -234,21 +244,45 @@ def noise_of_offsets(sets: Sequence[NDArray], shifts: Sequence[Array], bits: int
         np.tensordot(pseudo_inverse(turns)[0], one[:, usable].astype(float), 1) for turns, one in zip(shifts, tiles, strict=True)
     ]
     scene = np.average(offsets, axis=0, weights=steps)
-    power = np.zeros(len(scene))
+    power, beside = np.zeros(len(scene)), np.zeros((len(scene), 5))
+    freedom = (len(sets) - 1.0) * (TILE**2 - 8)  # less the shapes
     for n, turns, images, offset in zip(steps, shifts, sets, offsets, strict=True):
         around = np.stack([cv2.filter2D(image, cv2.CV_32F, AROUND / 8) for image in images])  # without the pixel's own noise
         c, s = in_tiles(np.tensordot(pseudo_inverse(turns)[1:], around, 1))[:, usable]
         waves = [np.hypot(c, s) * np.exp(1j * m * np.arctan2(s, c)) for m in (1, 2, n)]
         shapes = [np.ones_like(scene), scene, *(one for wave in waves for one in (wave.real, wave.imag))]
-        power += n * (_beside(offset - scene, np.stack(shapes, axis=1)) ** 2).sum(axis=1)
-    freedom = np.full(len(scene), (len(sets) - 1.0) * (TILE**2 - 8))  # less the shapes
-    return TileNoise(scene.mean(axis=1), power / freedom, freedom)
+        left = _beside(offset - scene, np.stack(shapes, axis=1))
+        power += n * (left**2).sum(axis=1)
+        own = (left**2).sum(axis=1) / (TILE**2 - 8)
+        beside += _correlation(_of_pairs(left), own, _orthonormal(np.stack(shapes, axis=2))) / len(sets)
+    return TileNoise(scene.mean(axis=1), power / freedom, np.full(len(scene), freedom), beside)
 
 
 def _beside(values: NDArray, shapes: NDArray) -> NDArray:
     """What is left of tiles' values (t, p) by least squares with shapes (t, m, p)."""
     inverse = np.linalg.pinv(shapes @ shapes.swapaxes(1, 2), hermitian=True)
     return values - ((shapes @ values[..., None]).swapaxes(1, 2) @ inverse @ shapes)[:, 0]
+
+
+def _of_pairs(noise: NDArray) -> Array:
+    """Mean products of neighbouring pixels' noise (..., p) : (..., 5), as in `TileNoise.beside`."""
+    square = noise.reshape(*noise.shape[:-1], TILE, TILE)
+    rows, columns = square[..., :, 1:] * square[..., :, :-1], square[..., 1:, :] * square[..., :-1, :]
+    diagonals = square[..., 1:, 1:] * square[..., :-1, :-1] + square[..., 1:, :-1] * square[..., :-1, 1:]
+    borders = rows[..., :, TILE // 2 - 1].mean(axis=-1) + columns[..., TILE // 2 - 1, :].mean(axis=-1)
+    away = square[..., :, FAR:] * square[..., :, :-FAR], square[..., FAR:, :] * square[..., :-FAR, :]
+    near = [one.mean(axis=(-2, -1), dtype=float) for one in (rows, columns, diagonals / 2)]
+    far = (away[0].mean(axis=(-2, -1), dtype=float) + away[1].mean(axis=(-2, -1), dtype=float)) / 2
+    return np.stack([*near, borders / 2, far], axis=-1)
+
+
+def _correlation(pairs: Array, power: Array, basis: Array) -> Array:
+    """Correlation : (t, 5) of neighbours by their products, and a pixel's variance, in the same number of residuals of a fit.
+
+    What a fit with an orthonormal basis (t, p, m) takes from white noise correlates the rest, which is put right.
+    """
+    taken = _of_pairs(basis.swapaxes(1, 2)).sum(axis=1)
+    return pairs / np.maximum(power, 1e-12)[:, None] + taken
 
 
 def _noise_beside(images: NDArray, shifts: Array, waves: Array, bits: int) -> TileNoise:
@@ -267,7 +301,9 @@ def _noise_beside(images: NDArray, shifts: Array, waves: Array, bits: int) -> Ti
     free = 1 - (basis**2).sum(axis=2)  # of a pixel's noise, what the fit leaves: less of bright ones, which are noisier
     pixels = free.sum(axis=1)
     level = (free * offset).sum(axis=1) / pixels
-    return TileNoise(level, (noise**2).sum(axis=(0, 2)) / (len(left) * pixels), len(left) * pixels)
+    variance = (noise**2).sum(axis=(0, 2)) / (len(left) * pixels)
+    beside = _correlation(_of_pairs(noise).mean(axis=0), variance, basis)
+    return TileNoise(level, variance, len(left) * pixels, beside)
 
 
 def _orthonormal(shapes: Array) -> Array:

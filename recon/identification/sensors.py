@@ -28,11 +28,23 @@ from recon.identification.photon_transfer import (
     transfer_line,
 )
 from recon.identification.pixel_response import pixel_response
+from recon.identification.raw_images import describe_drift, describe_processing
 from recon.model.patterns import Patterns
 from recon.model.rig import Sensor
 
 Array = NDArray[np.float64]
 
+FIELDS = (  # that images may show, or can't
+    "saturation_e",
+    "dark_noise_e",
+    "dsnu_e",
+    "prnu",
+    "black_level_dn",
+    "quantum_efficiency",
+    "adc_bits",
+    "dark_current_e_per_s",
+)
+NOT_RAW = "images aren't raw"
 NOISE = "noise_at_zero_dn2."  # of a camera: its line of variance over level, 8-bit DN^2, at level 0
 UNIFORM = 1 / np.sqrt(12)  # standard deviation of a range of 1
 NO_LINE = PhotonTransfer(1.0, 0.0, np.diag([1e-12, 1e12]), 0.0, 0.0)  # without a gain, electrons stand for DN
@@ -65,6 +77,7 @@ class ImageSettings:
     bits: int  # of the images
     gain: float | None = None  # linear; None: taken as 1
     adc_bits: int | None = None  # by the data sheet, if at hand
+    processed: bool = False  # images that aren't raw count all the same
 
     @property
     def step(self) -> tuple[float, float]:
@@ -114,9 +127,12 @@ def identify_sensor(
     Returns
     -------
     Findings
-        `CAMERA.sensor.FIELD` for all fields but the pixel's size.
+        `CAMERA.sensor.FIELD` for all fields but the pixel's size. Of images that aren't raw no field is known.
     """
     n = camera + ".sensor."
+    processing = None if settings.processed else _processing(settings, flats, sequences)
+    if processing is not None:
+        return without_raw_images(camera, processing)
     line, seen = _line(settings, flats, sequences)
     unknown = {
         n + "quantum_efficiency": "images count electrons; the light's power on a pixel isn't known, so photons aren't",
@@ -125,7 +141,8 @@ def identify_sensor(
     }
     if line is None:
         patterns = "eight steps of fringes, three sets of fewer, or a code with its inverses"
-        why = f"needs flat frames, or {patterns}, with a noise of 0.6 DN or more, at several levels or with dark frames"
+        noise = "a noise of 0.6 DN or more (JPEG and denoising leave less)"
+        why = f"needs flat frames, or {patterns}, with {noise}, at several levels or with dark frames"
         unknown |= dict.fromkeys((n + "saturation_e", n + "prnu"), why)
     found = Findings({}, unknown)
     stacks = sorted(dark, key=lambda stack: stack.exposure_s or 0.0)
@@ -134,6 +151,11 @@ def identify_sensor(
     else:
         found |= _without_dark(n, settings, line, seen, flats)
     return found
+
+
+def without_raw_images(camera: str, why: str) -> Findings:
+    """No field of a sensor, whose images aren't what it measured."""
+    return Findings({}, {f"{camera}.sensor.{name}": f"{NOT_RAW}: {why}" for name in FIELDS})
 
 
 def without_light(black_level: Estimate, settings: ImageSettings) -> Estimate:
@@ -166,6 +188,22 @@ def _range(settings: ImageSettings, black_level_dn: float) -> float:
     return gain * 2.0 ** (settings.bits - 8) * (256 - black_level_dn)
 
 
+def _processing(settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]) -> str | None:
+    """What was done to the images, in words, by flat frames or by patterns."""
+    drift = describe_drift(flats)
+    if drift is not None:
+        return drift
+    by_flats = [noise_of_flat(frames, settings.bits) for frames in flats]
+    by_patterns = [noise_of_patterns(stack.images, stack.patterns, settings.bits) for stack in sequences]
+    for tiles, flat in ((by_flats, True), ([one for one in by_patterns if one is not None], False)):
+        if tiles:
+            noise = TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))
+            why = describe_processing(noise, transfer_line(noise), by_flats=flat)
+            if why is not None:
+                return why
+    return None
+
+
 def _line(
     settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]
 ) -> tuple[PhotonTransfer | None, str]:
@@ -184,6 +222,7 @@ def _line(
     if not tiles:
         return None, ""
     gain = " at gain 1, as the camera's isn't known" if settings.gain is None else ""
+    gain += " taken for raw ones" if settings.processed else ""
     line = transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True))))
     if line is not None and not flats and not any(has_free_dimensions(part) for one in sequences for part in one.patterns.parts):
         line = replace(line, covariance=line.covariance + np.diag([(LIMITS.few_steps * line.gain) ** 2, 0.0]))

@@ -21,7 +21,7 @@ from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_ma
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError, one_line
 from recon.files import atomic, yaml_text
-from recon.identification import calibrated_optics, lenses, projector, rig_file, sensors, vignetting
+from recon.identification import calibrated_optics, lenses, projector, raw_images, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur
 from recon.identification.sensors import DarkStack, ImageSettings, PatternStack
@@ -43,21 +43,12 @@ GROUP = "conditions."
 CAMERAS = ("cam1", "cam2")
 BLUR_SIGMA_PX = 0.15, 0.5  # of a camera's point spread where no board showed it, and with its defocus where none showed this
 NOISE_POSES = 3  # of a board whose fringes tell the noise: tiles enough
+JPEG = (".jpg", ".jpeg")
 BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
 
 LENS = ("f_number", "focus_mm", "blur_px", "vignetting")
-SENSOR = (
-    "saturation_e",
-    "dark_noise_e",
-    "dsnu_e",
-    "prnu",
-    "black_level_dn",
-    "quantum_efficiency",
-    "adc_bits",
-    "dark_current_e_per_s",
-)
 NOT_SEEN = {  # reasons of what no part of a capture shows
-    **{f"{camera}.sensor.{name}": f"no images of {camera}" for camera in CAMERAS for name in SENSOR},
+    **{f"{camera}.sensor.{name}": f"no images of {camera}" for camera in CAMERAS for name in sensors.FIELDS},
     **{f"{camera}.lens.{name}": f"no board of discs before {camera}" for camera in CAMERAS for name in LENS},
     **{f"projector.lens.{name}": "no surface under patterns before cam1" for name in LENS},
     "projector.lens.vignetting": "no board lit by the projector",
@@ -92,6 +83,8 @@ class Settings(scanner_step.Fields):
     """linear, of the cameras: 1 fills the range with the sensor's saturation charge; null: as the capture has it, else 1"""
     adc_bits: Annotated[int | None, Field(ge=8, le=16)] = None
     """of both cameras' converters, by the data sheet, if at hand; else as of `rig`, with a doubt"""
+    processed: bool = False
+    """take images that aren't raw (JPEG, demosaiced, filtered, with a gamma) for the sensor's; else they show no number of it"""
     still: tuple[str, ...] = ()
     """names of the capture's sweeps with frames of both cameras and the target in a stand: the tracker's noise"""
     hand: tuple[str, ...] = ()
@@ -201,9 +194,13 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
     calibration = next(iter(shots.values())).calibration if board is None else board[1].adjustment.calibration
     rig = calibrated_optics.with_devices(rig, calibration)
     found |= calibrated_optics.findings(calibration)
+    files = {camera: list(_files(camera, settings, manifest)) for camera in frames}
     for camera, own in frames.items():
         with watch.busy(f"measuring the sensor of {camera}"):
-            found |= _sensor(camera, settings, own, list(_stacks(camera, shots.get(camera), board)))
+            found |= _sensor(camera, settings, own, list(_stacks(camera, shots.get(camera), board)), files[camera])
+        why = found.unknown.get(f"{camera}.sensor.saturation_e", "")
+        if why.startswith(sensors.NOT_RAW):
+            watch.warn(f"{camera}: {why}; the light of lenses and projector is by these images, too")
     if board is not None:
         with watch.busy("measuring the lenses"):
             found |= _lenses(*board, settings, rig, found)
@@ -292,11 +289,27 @@ def _stacks(camera: str, shot: SurfaceCapture | None, board: tuple[BoardCapture,
                 yield PatternStack(fringes, board[0].patterns)
 
 
-def _sensor(camera: str, settings: Settings, frames: _Frames, sequences: Sequence[PatternStack]) -> Findings:
+def _files(camera: str, settings: Settings, manifest: Manifest) -> Iterator[Path]:
+    """Image files by which a camera's sensor is measured."""
+    if manifest.surface is not None:
+        yield from map(Path, manifest.surface.images.get(camera, ()))
+    elif manifest.board is not None:
+        yield from (Path(path) for pose in manifest.board.poses for path in pose.fringes.get(camera, ()))
+    for folder in (settings.dark, settings.flat):
+        if folder is not None:
+            yield from (folder / camera).rglob("*.*")
+
+
+def _sensor(
+    camera: str, settings: Settings, frames: _Frames, sequences: Sequence[PatternStack], files: Sequence[Path]
+) -> Findings:
     device, dark = frames.device, frames.dark
+    compressed = next((file for file in files if file.suffix.lower() in JPEG), None)
+    if compressed is not None and not settings.processed:
+        return sensors.without_raw_images(camera, f"{compressed.name} is a JPEG: {raw_images.SET}")
     return sensors.identify_sensor(
         camera,
-        ImageSettings(device.bits, _gain(settings, device), settings.adc_bits),
+        ImageSettings(device.bits, _gain(settings, device), settings.adc_bits, settings.processed),
         dark=[] if dark is None else [DarkStack(dark, device.exposure_s)],
         flats=frames.flats,
         sequences=sequences,

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from recon.capture.manifest import read_manifest
+from recon.identification.estimates import Findings
 from recon.session import rig_step
 from sonotwin.choices import read, read_rig
 from sonotwin.cli import main
@@ -196,3 +197,18 @@ def test_a_rendered_phantom_gives_a_scanner_for_other_verbs(tmp_path, capsys):
     again = [f"rig={ours / 'rig.yaml'}", f"ultrasound={ours / 'ultrasound.yaml'}", *stroke, "path.end_mm=[4,-40]"]
     assert main(["sweep", *again, f"out={tmp_path / 'again'}"]) == 0
     assert read_manifest(tmp_path / "again" / "capture").devices["us"].size == (96, 408)
+
+
+def test_images_stored_as_jpeg_show_no_sensor_unless_they_are_to(capture, frames, tmp_path, capsys, monkeypatch):
+    """Reasons in the rig's file, and a warning that names the file and what to set; the projector's light is left out here."""
+    monkeypatch.setattr(rig_step.projector, "identify", lambda *_, **__: Findings())
+    flat = shutil.copytree(frames / "flat", tmp_path / "flat")
+    cv2.imwrite(str(flat / "cam1" / "half" / "9.jpg"), np.full(SIZE[::-1], 90, np.uint8))
+    given = [f"capture={capture}", f"dark={frames / 'dark'}", f"flat={flat}"]
+    assert main(["identify", *given, f"out={tmp_path / 'ours'}"]) == 0
+    said = capsys.readouterr()
+    assert "cam1: images aren't raw: 9.jpg is a JPEG: set raw grey images, gamma 1" in said.err + said.out
+    measured = read_rig(tmp_path / "ours" / "rig.yaml").measured
+    assert not [name for name in measured if name.startswith("cam1.sensor")]
+    assert main(["identify", *given, "processed=true", f"out={tmp_path / 'asked'}"]) == 0
+    assert "cam1.sensor.black_level_dn" in read_rig(tmp_path / "asked" / "rig.yaml").measured
