@@ -30,7 +30,7 @@ from sonotwin.verbs.record import Config
 from tests.twin.small_rigs import half, half_as_fields
 from twin.optics.surface_session import calibration_of
 
-QUIET = ("preview.serve=false", "tracing.samples=4")
+QUIET = ("preview.serve=false", "tracing.samples=2")
 STROKE = ("path.start_mm=[-18,-2]", "path.end_mm=[-18,0]", "path.speed_mm_s=20", "frames.quality.rim=2")
 
 

@@ -83,16 +83,18 @@ def drawn(setup: Setup, skin: trimesh.Trimesh, way_mm: float, name: str) -> Ligh
     on_picture, in_light = shifted(0.0), shifted(way_mm)
     scale = rig.cam1.optics.size[0] / FULL_PX
     strokes = [scale * stroke for stroke in STROKES]
-    drawings = posted(rig, skin, sighted(pose_between(BREAST, on_picture), rng), strokes)
-    last_seen = sighted(pose_between(BREAST, on_picture), rng)
+    moved, going_on = pose_between(BREAST, on_picture), pose_between(on_picture, in_light)
+    drawings = posted(rig, skin, sighted(moved, rng), strokes)
+    last_seen = sighted(moved, rng)
     image = LivePicture(skin, rig.projector.optics.camera(), rig.projector.gamma).draw(drawings.strips, last_seen)
     seen = live_skin_accuracy.photographed(rig, build_scene(in_light), image)
     if setup.out is not None:
         cv2.imwrite(str(setup.out / f"live_mentor_{name}.png"), seen)
     ridges = light_errors.ridges(seen, scale * live_skin_accuracy.RIDGE_PX)
     light = light_errors.in_space(ridges, true_points(rig, in_light))
-    meant = [light_errors.in_space(dense(stroke), true_points(rig, on_picture)) for stroke in strokes]
-    return light_errors.compare(light, [rigid.apply(pose_between(on_picture, in_light), curve) for curve in meant])
+    shown = true_points(rig, on_picture)
+    meant = [light_errors.in_space(dense(stroke), shown) for stroke in strokes]
+    return light_errors.compare(light, [rigid.apply(going_on, curve) for curve in meant])
 
 
 def posted(rig: Rig, skin: trimesh.Trimesh, world_from_skin: Array, strokes: Sequence[Array]) -> Drawings:

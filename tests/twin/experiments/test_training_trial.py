@@ -48,7 +48,10 @@ def test_gains_are_of_the_means_of_trainings():
 def test_a_twin_that_is_the_rig_gains_all_that_can_be_gained(settings, monkeypatch):
     """With the true rig for the identified one both sets, and so both networks, are the same; those of another rig aren't."""
     pytest.importorskip("torch")
-    for name, value in {"SAMPLES": 4, "TRIED": 4, "STEPS": 3, "TRAININGS": 1, "VARIANTS": 1}.items():
+    from trainers import short_training
+
+    monkeypatch.setattr(short_training, "CROPS", 4)
+    for name, value in {"SAMPLES": 2, "TRIED": 2, "STEPS": 2, "TRAININGS": 2, "VARIANTS": 1}.items():
         monkeypatch.setattr(training_trial, name, value)
     monkeypatch.setattr(training_trial, "identified", lambda rig, *_: rig)
     figures = training_trial.measure(settings, 3)
