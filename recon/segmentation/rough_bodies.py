@@ -125,6 +125,7 @@ class LookLimits:
     denied: float = 0.1  # mean probability below which a dark body counts as the tissue's own
 
 
+WIDE = 6.0  # standard deviation of a blur, voxels, above which few cosines make it up
 LIMITS, CUT, GAP, FAINT, LOOK = MassLimits(), CutBodyLimits(), GapLimits(), FaintLimits(), LookLimits()
 CUT_WAYS: dict[Reason, str] = {
     "cut by a gap in the sweep": "scan there again",
@@ -668,9 +669,29 @@ def _risen(ratio: NDArray) -> Mask:
 
 
 def _smooth(values: NDArray, weight: NDArray, sigma: Array) -> NDArray:
+    """Means of values, weighed by their weights and a Gaussian; NaN where little is known nearby."""
     fields = (np.asarray(field, np.float32) for field in (weight, values * weight))
-    share, total = threads.mapped(lambda field: _blurred(field, sigma), fields)
+    blur = _widely_blurred if sigma.min() > WIDE else _blurred
+    share, total = threads.mapped(lambda field: blur(field, sigma), fields)
     return np.divide(total, share, out=np.full_like(total, np.nan), where=share > 0.02)
+
+
+def _widely_blurred(field: Map, sigma: Array) -> Map:
+    """A Gaussian blur of (nz, ny, nx) over many voxels, reflected at the sides: by the few cosines that it passes."""
+    aside, down, across = (_passed(*one) for one in zip(field.shape, sigma, strict=True))
+    lines = down.T @ (field @ across)
+    sheets = aside @ (aside.T @ lines.reshape(len(field), -1))
+    return (down @ sheets.reshape(lines.shape)) @ across.T
+
+
+def _passed(count: int, sigma: float) -> Map:
+    """Cosines : (count, k) of a discrete transform that a blur passes, each times the root of the share that is passed."""
+    least = 1e-7  # share of a cosine that is passed, as precise as the numbers
+    number = np.arange(count)
+    share = np.exp(-((np.pi * number * sigma / count) ** 2) / 2)
+    kept = number[share > least]
+    waves = np.cos(np.pi * np.outer(number + 0.5, kept) / count) * np.sqrt(np.where(kept, 2, 1) / count)
+    return (waves * np.sqrt(share[kept])).astype(np.float32)
 
 
 def _blurred(field: Map, sigma: Array) -> Map:

@@ -54,11 +54,10 @@ class Skeleton:
 
     def points(self) -> Array:
         """Points along the bones : (n, 4), x y z and the radius there, mm."""
+        start = np.array([(*bone.start, bone.radii[0]) for bone in self.bones])
+        end = np.array([(*bone.end, bone.radii[1]) for bone in self.bones])
         steps = np.linspace(0, 1, 6)[:, None]
-        rows = [
-            np.hstack([b.start + steps * (b.end - b.start), b.radii[0] + steps * (b.radii[1] - b.radii[0])]) for b in self.bones
-        ]
-        return np.concatenate(rows)
+        return (start[:, None] + steps * (end - start)[:, None]).reshape(-1, 4)
 
 
 def gripping(rng: np.random.Generator, outline: Array, left: bool, turn: float) -> Skeleton:

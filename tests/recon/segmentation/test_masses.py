@@ -252,6 +252,9 @@ def test_a_blur_is_a_gaussian_filter(rng, shape):
     """Another width along each axis, axes shorter than the kernel too."""
     field, sigma = rng.normal(size=shape).astype(np.float32), np.array([0.8, 2.3, 5.1])
     np.testing.assert_allclose(rough_bodies._blurred(field, sigma), ndimage.gaussian_filter(field, sigma), atol=1e-6)
+    wide = np.array([6.0, 30.0, 11.0])
+    exact = ndimage.gaussian_filter(field.astype(float), wide, truncate=8)
+    np.testing.assert_allclose(rough_bodies._widely_blurred(field, wide), exact, atol=1e-6)
 
 
 @pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.9, 0.4, 0.25), (4.0, 0.3, 0.5)])
