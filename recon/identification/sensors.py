@@ -11,7 +11,7 @@ Source: EMVA 1288, Release 4.0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,6 @@ from recon.identification.estimates import Estimate, Findings
 from recon.identification.photon_transfer import (
     PhotonTransfer,
     TileNoise,
-    has_free_dimensions,
     noise_of_flat,
     noise_of_patterns,
     transfer_line,
@@ -59,7 +58,6 @@ class SensorLimits:
     exposure_s: float = 1 / 30  # at most, where it isn't known
     black_level_dn: float = 16.0  # at most, 8-bit; where no dark frames measure it
     gain: float = 0.2  # relative standard deviation of K, at most
-    few_steps: float = 0.05  # relative standard deviation of K by sets of few steps: six poses of a public board scatter by 3 %
     dark: float = 0.3  # of dark noise and DSNU, at most; a DSNU is known as well where it is surely less than the noise
     dark_noise_e: float = 40.0  # at most; where no dark frames measure it
     one_value: float = 0.3  # DN, scatter of dark frames that show one value: the black level lies anywhere within its step
@@ -122,7 +120,7 @@ def identify_sensor(
     flats : (m, h, w) each, m >= 2
         Frames of one steady, smooth light; best of two levels or more, with some hundreds of electrons at least.
     sequences : PatternStack
-        With eight steps of fringes or more, three sets of fewer, or a code and its inverses.
+        With eight steps of fringes or more, an even number of binary ones, or a code and its inverses.
 
     Returns
     -------
@@ -140,7 +138,7 @@ def identify_sensor(
         n + "dark_current_e_per_s": "needs dark frames of two exposures, and a gain",
     }
     if line is None:
-        patterns = "eight steps of fringes, three sets of fewer, or a code with its inverses"
+        patterns = "eight steps of fringes, an even number of binary ones, or a code with its inverses"
         noise = "a noise of 0.6 DN or more (JPEG and denoising leave less)"
         why = f"needs flat frames, or {patterns}, with {noise}, at several levels or with dark frames"
         unknown |= dict.fromkeys((n + "saturation_e", n + "prnu"), why)
@@ -223,10 +221,7 @@ def _line(
         return None, ""
     gain = " at gain 1, as the camera's isn't known" if settings.gain is None else ""
     gain += " taken for raw ones" if settings.processed else ""
-    line = transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True))))
-    if line is not None and not flats and not any(has_free_dimensions(part) for one in sequences for part in one.patterns.parts):
-        line = replace(line, covariance=line.covariance + np.diag([(LIMITS.few_steps * line.gain) ** 2, 0.0]))
-    return line, names + gain
+    return transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))), names + gain
 
 
 def _without_dark(n: str, settings: ImageSettings, line: PhotonTransfer | None, seen: str, flats: Sequence[NDArray]) -> Findings:

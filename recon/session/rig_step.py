@@ -23,6 +23,7 @@ from recon.errors import InputError, one_line
 from recon.files import atomic, yaml_text
 from recon.identification import calibrated_optics, lenses, projector, raw_images, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
+from recon.identification.photon_transfer import has_free_dimensions
 from recon.identification.projector import CameraBlur
 from recon.identification.sensors import DarkStack, ImageSettings, PatternStack
 from recon.model.boards import Discs
@@ -114,6 +115,8 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
     scans = (Path(name) for name in (settings.tissue, settings.air, settings.steps) if name)
     inputs = (settings.capture, settings.calibration, settings.dark, settings.flat, settings.room, *settings.probes, *scans)
     atomic.check_folder(out, BY, inputs=inputs)
+    if settings.conditions is None:
+        raise InputError("conditions: expected those to begin with, found none")
     _check_version(settings.rig, out / RIG)
     rig, found, scanned, manifest = identify(settings, watch)
     conditions = _conditions(settings.conditions, found)
@@ -197,7 +200,7 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
     files = {camera: list(_files(camera, settings, manifest)) for camera in frames}
     for camera, own in frames.items():
         with watch.busy(f"measuring the sensor of {camera}"):
-            found |= _sensor(camera, settings, own, list(_stacks(camera, shots.get(camera), board)), files[camera])
+            found |= _sensor(camera, settings, own, list(_stacks(camera, own.device, shots.get(camera), board)), files[camera])
         why = found.unknown.get(f"{camera}.sensor.saturation_e", "")
         if why.startswith(sensors.NOT_RAW):
             watch.warn(f"{camera}: {why}; the light of lenses and projector is by these images, too")
@@ -277,11 +280,18 @@ def _films(settings: Settings, rig: Rig, calibration: Calibration | None, watch:
     return found | hand_step.compare_probes(settings.probes)
 
 
-def _stacks(camera: str, shot: SurfaceCapture | None, board: tuple[BoardCapture, Result] | None) -> Iterator[PatternStack]:
-    """Sequences that a camera saw: of the surface, or else of the board's first poses."""
+def _stacks(
+    camera: str, device: Device, shot: SurfaceCapture | None, board: tuple[BoardCapture, Result] | None
+) -> Iterator[PatternStack]:
+    """Sequences that a camera saw: of the surface, or where these show no noise, of the board's first poses, set alike."""
     if shot is not None:
         yield PatternStack(shot.images, shot.patterns)
-    elif board is not None and camera == board_part.FRINGE_CAMERA and board[0].patterns is not None:
+        if any(map(has_free_dimensions, shot.patterns.parts)):
+            return
+    if board is not None and camera == board_part.FRINGE_CAMERA and board[0].patterns is not None:
+        own = board[0].devices[camera]
+        if (own.bits, own.gain) != (device.bits, device.gain):
+            return
         lit = [number for number, record in enumerate(board[0].records) if camera in record.fringes]
         for number in lit[:NOISE_POSES]:
             fringes = board[0].pose(number).fringes
@@ -431,10 +441,8 @@ def _images(folder: Path, device: Device) -> Images:
     return read_images(paths, device.size, device.bits)
 
 
-def _conditions(before: Part | None, found: Findings) -> Part:
+def _conditions(before: Part, found: Findings) -> Part:
     """Conditions with what was measured of them; InputError if they can't be."""
-    if before is None:
-        raise InputError("conditions: expected those to begin with, found none")
     content = before.model_dump(mode="json")
     for name, one in found.estimates.items():
         if name.startswith(GROUP):
