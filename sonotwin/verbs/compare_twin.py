@@ -66,10 +66,10 @@ def run(config: Config) -> None:
     found = rerendering.rerender(config.capture, config.rig, config.conditions, config.camera, config.tracing, config.seed, watch)
     name = read_manifest(config.capture).name_of(config.capture)
     with watch.busy("writing the page"), atomic.new_folder(config.out, BY) as new:
-        likeness_report.write(
-            new / REPORT, found.real, found.twin, found.likeness, name, source_of(config, name), [command_of(config)]
-        )
-        figures = likeness_report.metrics_of(found.likeness) | {"room_lux": found.room_lux}
+        source = f"{source_of(config, name)} The surface’s {found.seen.reflectance_in_words}."
+        likeness_report.write(new / REPORT, found.real, found.twin, found.likeness, name, source, [command_of(config)])
+        figures = likeness_report.metrics_of(found.likeness)
+        figures |= {"room_lux": found.seen.room_lux, "reflectance": found.seen.reflectance}
         metrics.write(new / metrics.FILE, figures)
     for line in likeness_report.unexplained(found.real, found.likeness):
         watch.say(f"unexplained {line}")

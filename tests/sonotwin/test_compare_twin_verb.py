@@ -67,12 +67,16 @@ def test_the_right_rig_explains_all_and_a_wrong_one_is_named(small, capture, num
     rig_file.write(tmp_path / "rig.yaml", changed(small, number, share), {}, "a test")
     out = tmp_path / "out"
     assert main(["compare-twin", f"capture={capture}", f"rig={tmp_path / 'rig.yaml'}", "tracing.samples=16", f"out={out}"]) == 0
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("unexplained")]
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("scene") and "reflectance assumed 0.80: light between places doesn't" in line for line in lines)
+    said = [line for line in lines if line.startswith("unexplained")]
     assert said[0].startswith(f"unexplained {told}"), said
     figures = json.loads((out / "metrics.json").read_text())
     assert (figures["beyond_bars"] == 0) == (not number)
     page = (out / "report.html").read_text()
-    assert told.partition(":")[0] in page and "None of the rig’s numbers was measured" in page
+    assert (
+        told.partition(":")[0] in page and "None of the rig’s numbers was measured" in page and "reflectance assumed 0.80" in page
+    )
 
 
 def test_what_does_not_fit_is_refused(small, capture, tmp_path, capsys):

@@ -23,6 +23,7 @@ from twin.evaluation import likeness
 from twin.evaluation.likeness import Likeness, Taken
 from twin.optics import seen_surface, surface_session
 from twin.optics.light_transport import Tracing
+from twin.optics.seen_surface import SeenScene
 from twin.optics.surface_session import CameraName, Shooting
 from twin.sensor import Exposure
 
@@ -36,7 +37,7 @@ class Rerendered:
     real: Taken
     twin: Taken
     likeness: Likeness
-    room_lux: float  # as found
+    seen: SeenScene
 
 
 def rerender(
@@ -60,7 +61,7 @@ def rerender(
     ------
     InputError
         If the capture is incomplete or damaged, is of devices of other sizes, has more bits than the rig's camera, or shows no
-        surface.
+        surface, or one whose white is clipped everywhere.
     """
     shots, device = read(capture, rig, camera)
     exposure = Exposure(device.exposure_s or UNKNOWN_S, device.gain or 1.0, device.bits)
@@ -69,7 +70,7 @@ def rerender(
     with watch.busy("finding its reflectance"):
         seen = seen_surface.scene_of(shots, skin, rig, camera, exposure, tracing, seed)
     pixels = np.count_nonzero(seen.inside)
-    watch.say(f"scene       {pixels} px of a surface, reflectance {seen.reflectance:.2f}, room light {seen.room_lux:.3g} lux")
+    watch.say(f"scene       {pixels} px of a surface, room light {seen.room_lux:.3g} lux, {seen.reflectance_in_words}")
     shooting = Shooting(exposure_s=exposure.time_s, gain=exposure.gain, bits=exposure.bits)
     lit = tracing.model_copy(update={"room_lux": seen.room_lux})
     with watch.busy(f"rendering {shots.patterns.count} patterns"):
@@ -79,7 +80,7 @@ def rerender(
     with watch.busy("comparing"):
         real, twin = _taken(shots.images, shots, skin, rig, camera), _taken(view.images, shots, again, rig, camera)
         found = likeness.compare(real, twin, seen.inside, conditions.frames)
-    return Rerendered(real, twin, found, seen.room_lux)
+    return Rerendered(real, twin, found, seen)
 
 
 def read(capture: Path, rig: Rig, camera: CameraName) -> tuple[SurfaceCapture, Device]:

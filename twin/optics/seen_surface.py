@@ -5,14 +5,14 @@ and under a black image, whatever gamma and blur are. Over the light that the ri
 what the dark image has beyond the black level is the room's light. So neither fringes nor edges are used for what they test.
 
 A part of that light came from other places of the surface. It is in dark stripes, too, and grows with the reflectance, which is
-found by it, with as many reflections as are traced. With one, images show the product of flux and reflectance alone, and the flux
-is set so that bright places have a usual one.
+found by it, with as many reflections as are traced. On a plane, and with one reflection, images show the product of flux and
+reflectance alone, and the flux is set so that bright places have a usual one.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import mitsuba as mi
@@ -23,6 +23,7 @@ from scipy.ndimage import binary_closing, gaussian_filter
 from scipy.optimize import minimize_scalar
 
 from recon.capture.surface_part import SurfaceCapture
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.model.patterns import Axis, Fringes, GrayCode, Patterns, Uniform
@@ -42,6 +43,7 @@ from twin.sensor import Exposure, electrons_per_radiance, number_per_electron
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]  # (h, w)
+KnownBy = Literal["found", "or less", "or more", "assumed"]  # a reflectance: beyond the least or the most that is tried
 
 INSIDE_PX = 4.0  # projector px from an edge, and half a period of the fringes, from which on a place counts as inside a stripe
 UNCLIPPED, WINDOW = 0.96, (5, 5)  # of full scale: means of neighbouring px are below where none of them is clipped
@@ -54,6 +56,9 @@ GAP_PX = 6  # camera px, half the width of gaps that are closed
 FEW = 4  # paths a pixel of light between places, which is smoothed
 ROUNDS = 2  # of that light and the reflectance
 LEAST, MOST = 0.03, 0.95  # reflectance of bright places that light between them may tell
+BLOCKS = 8  # of the surface's longer side, and fewest in all; errors of light in the dark go together within one
+CLEAR = 5.0  # times its scatter between blocks, of a gain over the least or the most: 10 to 13 in grooves, 3 at most on a sphere
+AT_END = 0.01  # share of the least or the most reflectance, within which one counts as that
 SLOPE = 0.02  # rad, of the surface's slopes by the points' noise after smoothing
 LEAST_PX, MOST_PX = 0.7, 4.0  # camera px, standard deviation of that smoothing
 BEHIND_MM, CLOTH_MM = 100.0, 5000.0  # distance and size of a black cloth behind it
@@ -84,8 +89,16 @@ class SeenScene:
     rig: Rig  # with the flux by which bright places have a usual reflectance
     scene: Scene
     room_lux: float
-    reflectance: float  # of bright places: as usual, unless light between places shows it
+    reflectance: float  # of bright places
+    known_by: KnownBy  # that reflectance: assumed as usual, where light between places doesn't show it
     inside: NDArray[np.bool_]  # (h, w) pixels whose surroundings are on the surface, and alike on it
+
+    @property
+    def reflectance_in_words(self) -> str:
+        """That of bright places, and whether it was found."""
+        if self.known_by == "assumed":
+            return f"reflectance assumed {self.reflectance:.2f}: light between places doesn't show it"
+        return f"reflectance {self.reflectance:.2f}{'' if self.known_by == 'found' else f' {self.known_by}'}"
 
 
 def stripes(patterns: Patterns) -> Iterator[Edges]:
@@ -140,7 +153,8 @@ def seen_light(images: NDArray, patterns: Patterns, found: ProjectorMap, gamma: 
     with np.errstate(invalid="ignore"):
         dark, bright = sums / np.where(weights > 0, weights, np.float32(np.nan))
     for part, place in patterns.slices():
-        if not isinstance(part, Fringes) or not (clipped := np.isnan(bright) & np.isfinite(dark)).any():
+        clipped = np.isnan(bright) & np.isfinite(dark)
+        if not isinstance(part, Fringes) or not clipped.any() or not np.isfinite(bright).any():
             continue
         with np.errstate(divide="ignore", invalid="ignore"):
             beyond = np.where(images[place].max(axis=0) < full, images[place].mean(axis=0, dtype=np.float32) - dark, np.nan)
@@ -181,7 +195,7 @@ def scene_of(
     Raises
     ------
     InputError
-        If there are pixels that no ray reaches.
+        If there are pixels that no ray reaches, or none whose light under a white image is known.
     """
     device = getattr(rig, camera)
     points, inside = smoothed(skin.points, device.optics.camera())
@@ -219,6 +233,10 @@ def scene_of(
     with np.errstate(divide="ignore", invalid="ignore"):
         albedo = EVEN * white / lit(np.full(white.shape, np.float32(EVEN)))
     known = np.isfinite(albedo) & (albedo > 0) & np.isfinite(points[..., 0])
+    if not known.any():
+        clipped = not np.isfinite(light.bright).any()
+        cause = "white is clipped everywhere; record with a shorter exposure" if clipped else "the projector lights none of it"
+        raise InputError(f"{shots.name}: expected a surface under white below {UNCLIPPED:.0%} of full scale, found that {cause}")
     usable = known & inside if (known & inside).any() else known  # at borders and steps reflectances are wrong
     scale = float(np.percentile(albedo[usable], BRIGHT)) / USUAL
     albedo = np.clip(_filled(np.where(known, albedo / np.float32(scale), np.float32(np.nan))), 0, 1)
@@ -227,11 +245,11 @@ def scene_of(
     albedo = np.clip(albedo * np.clip(sharper, 1 / SHARPEST, SHARPEST), 0, 1)
     share, direct = optics.transmission * np.float32(per_radiance), white
     beyond = light.dark - _black_dn(rig, camera, exposure) - white / np.float32(rig.projector.contrast)
-    between = np.float32(0)
+    between, known_by = np.float32(0), "assumed"
     for _ in range(ROUNDS if tracing.bounces > 1 else 0):
         orders = [SeenLight(*(_but_for(albedo, np.float32(scale) * side) for side in one)) for one in again(albedo)]
         bright = float(np.percentile(albedo[usable], BRIGHT))
-        times = _reflectance(beyond, albedo * share, [one.dark for one in orders], usable, (LEAST / bright, MOST / bright))
+        times, known_by = reflectance_factor(beyond, albedo * share, [one.dark for one in orders], usable, bright)
         more, dark = (sum(times**k * one[side] for k, one in enumerate(orders, 1)) for side in range(2))
         left = np.nan_to_num(white / (direct + more - dark), nan=1.0, posinf=1.0)
         direct, between, scale = direct * left, dark * left, scale / times
@@ -244,6 +262,7 @@ def scene_of(
         Scene("seen", (thing, _backdrop(mesh))),
         room * LUMENS_PER_WATT * np.pi * 1e6,
         float(np.percentile(albedo[usable], BRIGHT)),
+        known_by,
         inside & known,
     )
 
@@ -257,18 +276,45 @@ def _but_for(base: Image, light: Image) -> Image:
     return np.where(base > 0, base * share, np.float32(np.nan))
 
 
-def _reflectance(beyond: Image, even: Image, dark: list[Image], known: NDArray[np.bool_], bounds: tuple[float, float]) -> float:
+def reflectance_factor(
+    beyond: Image, even: Image, dark: list[Image], known: NDArray[np.bool_], bright: float
+) -> tuple[float, KnownBy]:
     """Factor of the reflectance by which light between places explains what is in dark stripes, beside an even room's.
 
-    Light that comes back n times goes with its n-th power; the flux goes down as the reflectance goes up.
+    Light that comes back n times goes with its n-th power; the flux goes down as the reflectance goes up. Where that light is too
+    little to tell the best reflectance from the least and from the most one, the factor is that of the usual one. It is told
+    by blocks of the image, for noise is not all that the light in dark stripes has besides.
+
+    Parameters
+    ----------
+    bright : reflectance of bright places that goes with a factor of 1
     """
     told = known & np.isfinite(beyond) & np.isfinite(dark).all(axis=0)
+    if not told.any():
+        return USUAL / bright, "assumed"
 
-    def unexplained(times: float) -> float:
+    def unexplained(times: float) -> Array:
         rest = beyond[told] - sum(times**k * one[told] for k, one in enumerate(dark, 1))
-        return float(np.abs(rest - max(np.median(rest / even[told]), 0.0) * even[told]).mean())
+        return np.abs(rest - max(np.median(rest / even[told]), 0.0) * even[told])
 
-    return float(minimize_scalar(unexplained, bounds=bounds, method="bounded").x)
+    least, most = LEAST / bright, MOST / bright
+    best = float(minimize_scalar(lambda times: float(unexplained(times).mean()), bounds=(least, most), method="bounded").x)
+    place = np.stack(np.nonzero(told))
+    place -= place.min(axis=1, keepdims=True)
+    row, column = place * BLOCKS // (place.max() + 1)
+    block = row * BLOCKS + column
+    number = np.bincount(block)
+
+    def clearly_less_than(times: float) -> bool:
+        """The best one's cost, by the scatter of the difference between blocks."""
+        gain = unexplained(times) - unexplained(best)
+        scatter = np.sqrt(np.sum((np.bincount(block, gain) - gain.mean() * number) ** 2))
+        return np.count_nonzero(number) >= BLOCKS and bool(gain.sum() > CLEAR * scatter)
+
+    if not clearly_less_than(least) and not clearly_less_than(most):
+        return USUAL / bright, "assumed"
+    at_end: list[KnownBy] = [name for name, end in (("or less", least), ("or more", most)) if abs(best / end - 1) < AT_END]
+    return best, at_end[0] if at_end else "found"
 
 
 def smoothed(points: PointMap, camera: Camera) -> tuple[Image, NDArray[np.bool_]]:

@@ -1,9 +1,12 @@
 """A capture's surface as a scene: stripes, smoothing, and reflectance and room light against what was rendered."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from recon.capture.surface_part import SurfaceCapture
+from recon.errors import InputError
 from recon.geometry import rigid
 from recon.model.patterns import Fringes, GrayCode, Patterns, Uniform
 from recon.session import skin_step
@@ -66,6 +69,66 @@ def test_light_of_clipped_stripes_is_that_of_the_fringes():
     np.testing.assert_allclose(light.bright[known], 12 + albedo[known], rtol=0.01)
 
 
+@pytest.mark.parametrize(
+    ("truth", "light", "factor", "known_by"),
+    [
+        (0.6, 4.0, 0.6, "found"),
+        (1.0, 4.0, 1.0, "found"),
+        (0.0, 4.0, 0.0375, "or less"),
+        (2.0, 4.0, 1.1875, "or more"),
+        (0.6, 0.0, 1.0, "assumed"),
+        (0.6, 1e-3, 1.0, "assumed"),
+        (0.6, np.nan, 1.0, "assumed"),
+    ],
+)
+def test_light_in_the_dark_gives_the_reflectance_or_nothing(rng, truth, light, factor, known_by):
+    """Light between places from 0 to `light` DN aside from noise of 0.4 DN and blotches of 0.2 DN, which are alike over 10 px.
+
+    The factor's standard deviation is below 0.02 where it is found. Without light that shows, and without any px that is known,
+    the usual reflectance stays.
+    """
+    blotches = np.kron(rng.standard_normal((10, 12)), np.ones((10, 10)))
+    once = np.float32(light) * np.linspace(0, 1, 120, dtype=np.float32) * np.ones((100, 1), np.float32)
+    even, known = np.full(once.shape, 50, np.float32), np.ones(once.shape, bool)
+    beyond = 3 + truth * once + truth**2 * 0.1 * once + 0.4 * rng.standard_normal(once.shape) + 0.2 * blotches
+    found = seen_surface.reflectance_factor(np.float32(beyond), even, [once, 0.1 * once], known, seen_surface.USUAL)
+    assert found[1] == known_by and found[0] == pytest.approx(factor, abs=0.06)
+
+
+@pytest.fixture(scope="module", params=[3, 5])
+def plane(rig, request):
+    """The rig, and a capture and the exposure of a plane of 0.6, in a room of 20 lux."""
+    small = rig.model_copy(update={"cam1": cropped(rig.cam1, (160, 128))})
+    parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=7, complementary=True))
+    patterns = Patterns(projector_size=small.projector.optics.size, unwrap="gray", parts=parts)
+    tracing = Tracing(samples=8, bounces=3, room_lux=20)
+    view = shoot(small, build_scene({"kind": "plane"}), patterns, "cam1", tracing, Shooting(), request.param)
+    return small, SurfaceCapture(view.images, patterns, 8, calibration_of(small), "a plane"), view.exposure
+
+
+@pytest.mark.slow
+def test_a_plane_keeps_the_usual_reflectance(plane):
+    """Nothing is between places of a plane: 0.8 for its 0.6, and 0.8 / 0.6 of its flux and room light, to 3 %; and it says so."""
+    small, shots, exposure = plane
+    seen = seen_surface.scene_of(shots, skin_step.reconstruct(shots), small, "cam1", exposure, Tracing(samples=8, bounces=3), 4)
+    scale = seen.rig.projector.radiant_flux_w / small.projector.radiant_flux_w
+    assert seen.known_by == "assumed" and "assumed 0.8" in seen.reflectance_in_words
+    assert np.median(seen.scene.things[0].albedo) * scale == pytest.approx(0.6, rel=0.02)
+    assert seen.room_lux / scale == pytest.approx(20, rel=0.05) and scale == pytest.approx(0.75, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_surface_whose_white_is_clipped_is_refused(plane):
+    """In one line that names the cause, where no bright stripe is below full scale; fringes may be as they like."""
+    small, shots, exposure = plane
+    binary = np.array([one for _, one, _ in shots.patterns.profiles()])[:, None, None]
+    clipped = replace(shots, images=np.where(binary & (shots.images > 60), np.uint8(255), shots.images))
+    skin = skin_step.reconstruct(shots)
+    with pytest.raises(InputError, match=r"a plane: .* white is clipped") as raised:
+        seen_surface.scene_of(clipped, skin, small, "cam1", exposure, Tracing(samples=4, bounces=1), 4)
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.slow
 def test_reflectance_and_room_light_are_those_that_were_rendered(rig):
     """A sphere of 0.6 before a plane of 0.3, but for a factor that goes into the flux; and so the room's light over the flux."""
@@ -86,11 +149,13 @@ def test_reflectance_and_room_light_are_those_that_were_rendered(rig):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("bounces", "reflectance"), [(3, 0.85), (1, 0.0)])
-def test_light_in_a_hollow_tells_the_reflectance(rig, bounces, reflectance):
+@pytest.mark.parametrize(("bounces", "reflectance", "known_by"), [(3, 0.85, ("found", "or more")), (1, 0.0, ("or less",))])
+def test_light_in_a_hollow_tells_the_reflectance(rig, bounces, reflectance, known_by):
     """A groove of 100 degrees and 0.85: found to 0.05, and as even as it is; where no light was reflected twice, it is black.
 
-    What two captures of noise leave is 0.03: the bound of 0.95 of its lightest twentieth.
+    No light between places, where one of the usual reflectance would have had it by many standard deviations, is evidence of a
+    dark surface in strong light: so it is 0.03 or less, and not taken as usual. What two captures of noise leave is 0.03: the
+    bound of 0.95 of its lightest twentieth.
     """
     small = rig.model_copy(update={"cam1": cropped(rig.cam1, (240, 192))})
     points, triangles = solid_meshes.grid((36.0, 28.0), (180, 140))
@@ -104,6 +169,6 @@ def test_light_in_a_hollow_tells_the_reflectance(rig, bounces, reflectance):
     seen = seen_surface.scene_of(shots, skin_step.reconstruct(shots), small, "cam1", view.exposure, again, 4)
     surface = seen.scene.things[0]
     aside = np.abs(surface.mesh.vertices[:, 0])
-    assert np.median(surface.albedo) == pytest.approx(reflectance, abs=0.05)
+    assert seen.known_by in known_by and np.median(surface.albedo) == pytest.approx(reflectance, abs=0.05)
     ratio = np.median(surface.albedo[aside < 6]) / np.median(surface.albedo[aside > 11])
     assert ratio == pytest.approx(1, abs=0.03)
