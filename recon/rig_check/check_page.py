@@ -237,6 +237,12 @@ def _control(charts: Sequence[Chart], log: Sequence[Check]) -> list[str]:
         f"{old} check{'s' * (old != 1)} of the log have no motions beside deviations, as they are of an earlier version, or were "
         "tracked by cameras that moved: they aren't in the charts."
     )
+    again = len({time for one in charts for time in one.repeated})
+    repeated = (
+        "1 check of a recording that was checked before doesn't count."
+        if again == 1
+        else f"{again} checks of a recording that was checked before don't count."
+    )
     drawings = [
         page.drawing(_control_plot(one), TITLES[one.part], f"{len(one.times)} checks since {one.times[0]:%Y-%m-%d}.")
         for one in charts
@@ -249,6 +255,7 @@ def _control(charts: Sequence[Chart], log: Sequence[Check]) -> list[str]:
         f"one check {limit.sigma:.1f} σ, the sum that in the table. Of parts that are seen together, all may be beyond where one "
         "drifts.",
         *([left_out] if old else []),
+        *([repeated] if again else []),
     )
     return [*map(page.paragraph, reading), table, key, page.grid(drawings, "two")]
 

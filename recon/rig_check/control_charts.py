@@ -33,7 +33,8 @@ DEVICES, BY_BOTTOM = PARTS[:4], PARTS[4:]  # parts that the same measurements sh
 ALLOWANCE = 0.5  # standard deviations a check, that the sum forgets: half of a shift that it finds soonest
 SINGULAR = 1e-9  # of a variance, at least: directions that no check shows have none
 NODES = 48  # of Gauss's rule over the sum, for its average run length: to 1e-6 of it
-SELDOM = 1e-6  # chance of a false alarm, below which no limits are set
+SELDOM = 1e-6  # chance of a false alarm, that of 4.9 standard deviations: limits of less would be lost in rounding
+REPEATED = 1e-6  # of a standard deviation: checks of one recording differ by rounding alone
 GAIN = 2 * fault_tests.RIVAL  # of chi-square, below the best one's: another part that may be it
 
 
@@ -63,10 +64,11 @@ class Chart(NamedTuple):
     cusum: Array  # (n,) length of the cumulative sum
     limits: Limits
     change: Change
+    repeated: tuple[datetime, ...]  # of checks of a recording that was checked before, which don't count
 
     @property
     def out(self) -> bool:
-        """Whether the last check is out of control."""
+        """Whether the last check that counts is out of control."""
         return bool(self.sigma[-1] > self.limits.sigma or self.cusum[-1] > self.limits.cusum)
 
     @property
@@ -80,6 +82,8 @@ class Chart(NamedTuple):
 def charts(log: Sequence[Check], alarm_sigma: float) -> list[Chart]:
     """Charts of the parts that the last check of a log shows, each over the checks by its present calibration, if two or more.
 
+    A recording counts as often as it was made: checks that find the same again, to rounding, are no more days.
+
     alarm_sigma : of the verdict on a part, whose chance of a false alarm both charts of the part share.
     """
     found = []
@@ -89,23 +93,34 @@ def charts(log: Sequence[Check], alarm_sigma: float) -> list[Chart]:
             continue
         last = shown[-1][1]
         own = [each for each in shown if (each[1].against, len(each[1].motion)) == (last.against, len(last.motion))]
-        if len(own) > 1:
-            times, estimates = zip(*own, strict=True)
-            found.append(_chart(part, times, estimates, alarm_sigma))
+        again = [any(same(one, other) for _, other in own[:k]) for k, (_, one) in enumerate(own)]
+        if again.count(False) > 1:
+            times, estimates = zip(*(one for one, seen in zip(own, again, strict=True) if not seen), strict=True)
+            repeated = tuple(time for (time, _), seen in zip(own, again, strict=True) if seen)
+            found.append(_chart(part, times, estimates, alarm_sigma)._replace(repeated=repeated))
     return found
+
+
+def same(one: Estimate, other: Estimate) -> bool:
+    """Whether two checks found one motion with one covariance: they are of one recording."""
+    own, expected = np.array(one.own), np.array(other.own)
+    sigma = np.sqrt(np.maximum(np.diag(expected), 0))
+    apart = np.abs(np.array(one.motion) - other.motion)
+    alike = np.abs(own - expected) <= REPEATED * np.outer(sigma, sigma) + EXACT**2
+    return bool((apart <= REPEATED * sigma + EXACT).all() and alike.all())
 
 
 def _chart(part: str, times: tuple[datetime, ...], estimates: Sequence[Estimate], alarm_sigma: float) -> Chart:
     steps = innovations(estimates)
-    freedom = steps.shape[1]
-    sigma = np.array([fault_tests.as_sigma(float(one @ one), freedom) for one in steps])
+    shown = freedom(np.array(estimates[0].common) + np.mean([one.own for one in estimates], axis=0))
+    sigma = np.array([fault_tests.as_sigma(float(one @ one), shown) for one in steps])
     cusum = np.linalg.norm(cumulative_sums(steps), axis=1)
-    return Chart(part, times, sigma, cusum, limits(freedom, alarm_sigma), change(times, estimates))
+    return Chart(part, times, sigma, cusum, limits(shown, alarm_sigma), change(times, estimates), ())
 
 
 @cache
 def limits(dimension: int, alarm_sigma: float) -> Limits:
-    """Limits of motions of some dimensions: each chart alarms half as often as one number beyond `alarm_sigma`."""
+    """Limits of motions of some dimensions: each chart alarms half as often as one number beyond `alarm_sigma`, 4.9 at most."""
     chance = max(erfc(alarm_sigma / 2**0.5) / 2, SELDOM)
     return Limits(float(stats.norm.isf(chance / 2)), cusum_limit(1 / chance, dimension), 1 / chance)
 
@@ -128,10 +143,20 @@ def _whitening(covariance: Array) -> Array:
 
     It is that of the correlations, over standard deviations; directions of no variance, which no check shows, stay at zero.
     """
+    unit, variances, axes = _principal(covariance)
+    return axes / np.sqrt(np.maximum(variances, SINGULAR)) @ axes.T / unit
+
+
+def freedom(covariance: Array) -> int:
+    """Directions that checks show, one at least: innovations along the others are 0, and count as none."""
+    return max(int(np.sum(_principal(covariance)[1] > SINGULAR)), 1)
+
+
+def _principal(covariance: Array) -> tuple[Array, Array, Array]:
+    """Units : (k,), standard deviations or 1, and variances : (k,) and axes : (k, k) of a covariance in these units."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
     unit = np.where(sigma > EXACT, sigma, 1.0)
-    variances, axes = np.linalg.eigh(covariance / np.outer(unit, unit))
-    return axes / np.sqrt(np.maximum(variances, SINGULAR)) @ axes.T / unit
+    return unit, *np.linalg.eigh(covariance / np.outer(unit, unit))
 
 
 def cumulative_sums(innovations: Array) -> Array:

@@ -77,7 +77,8 @@ class Config(MeasuredTargetFields):
     lag: Path | None = None
     """file lag.json, of measure-lag; null leaves the scanner's clock unchecked"""
     alarm_sigma: Annotated[float, Field(ge=1, le=20)] = 3.2
-    """standard deviations beyond which a part has moved: one check of 120 by chance, over all six parts, or over all numbers"""
+    """standard deviations beyond which a part has moved: one check of 120 by chance, over all six parts, or over all
+    numbers; control charts over the days of `log` alarm at 4.9 at the latest"""
     water_c: Annotated[float, Field(ge=0, le=95)] = 22.0
     """deg C, of the tank"""
     water_sigma_c: NotNegative = 1.0

@@ -100,6 +100,7 @@ def test_a_clock_that_drifts_below_the_alarm_ends_with_status_1(bottom, tmp_path
     clock = made["parts"][5]["estimate"]
     clock |= {"motion": [clock["motion"][0] - 9e-3], "own": [[1e-6]], "common": [[2.5e-5]]}
     for day in range(2):
+        clock["motion"] = [clock["motion"][0] + 2e-6]
         made["time"] = f"2026-05-0{day + 1}T08:00:00Z"
         log.write_text(("" if day == 0 else log.read_text()) + json.dumps(made) + "\n")
     assert main(line) == 1

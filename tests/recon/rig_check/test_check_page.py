@@ -77,9 +77,10 @@ def test_the_limit_stands_apart_from_the_deviation():
 
 
 def clocks(lags) -> list[check_log.Check]:
-    """A check a day of a clock that is known to 5 ms, by checks good to 1 ms."""
+    """A check a day of a clock that is known to 5 ms, by checks good to 1 ms, that differ by some microseconds."""
     found = [
-        Finding(0.5, 1, np.array([lag]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[2.5e-5]]), False) for lag in lags
+        Finding(0.5, 1, np.array([lag + 2e-6 * day]), np.eye(1), np.ones(1), np.array([[1e-6]]), np.array([[2.5e-5]]), False)
+        for day, lag in enumerate(lags)
     ]
     verdicts = [Verdict("clock", "good", 0.5, 0.01, 0.02, finding=one) for one in found]
     made = [check_log.check("x", [one]) for one in verdicts]
@@ -101,3 +102,12 @@ def test_days_of_earlier_versions_are_said_to_be_missing_in_charts():
     old = [one.model_copy(update={"parts": (one.parts[0].model_copy(update={"estimate": None}),)}) for one in log[:2]]
     assert "2 checks of the log have no motions" in check_page.write_text(log[-1], [*old, *log[2:]], 3.2)
     assert "Control charts" not in check_page.write_text(old[-1], old, 3.2)
+
+
+def test_checks_of_one_recording_are_counted_once_and_the_page_says_so():
+    log = clocks([0.0] * 5)
+    again = [log[0].model_copy(update={"time": log[-1].time + timedelta(hours=k)}) for k in (1, 2)]
+    assert "5 checks since" in (text := check_page.write_text(again[-1], [*log, *again], 3.2))
+    assert "2 checks of a recording that was checked before don't count." in text.replace("&#x27;", "'")
+    assert "1 check of a recording that was checked before" in check_page.write_text(again[0], [*log, again[0]], 3.2)
+    assert "checked before" not in check_page.write_text(log[-1], log, 3.2)

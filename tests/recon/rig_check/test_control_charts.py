@@ -133,6 +133,15 @@ def test_the_best_part_is_named_with_its_rivals(rng):
     assert named == [["cam2", "cam1"], ["clock"]]
 
 
+@pytest.mark.parametrize(("likelihood", "named"), [(19.0, ["cam2", "cam1"]), (21.0, ["cam2"])])
+def test_rivals_explain_all_within_20_to_1(rng, likelihood, named):
+    """Camera 1 is out of control by a step of its own, of a likelihood below camera 2's: 2 log of it, of chi-square."""
+    chart = control_charts.charts(logged("cam2", estimates(rng, "cam2", 20, 1.0, np.repeat([0.0, 4.0], 10))), 3.2)[0]
+    gain = chart.change.gain - 2 * np.log(likelihood)
+    other = chart._replace(part="cam1", change=chart.change._replace(gain=gain))
+    assert other.out and [[one.part for one in rivals] for rivals in control_charts.drifting([other, chart])] == [named]
+
+
 def test_a_new_calibration_begins_a_chart(rng):
     """Its error is another, by which the old chart would be out."""
     old, new = (estimates(rng, "clock", 10, calibration=name) for name in ("first", "second"))
@@ -163,4 +172,40 @@ def test_what_no_check_shows_stays_at_zero(rng):
     steps = control_charts.innovations(course)
     assert np.abs(steps[:, 2]).max() < 1e-6 and np.isfinite(steps).all()
     log = [made.model_copy(update={"time": FIRST}) for made in logged("target", course)]
-    assert np.isfinite(control_charts.charts(log, 3.2)[0].change.motion).all()
+    chart = control_charts.charts(log, 3.2)[0]
+    assert np.isfinite(chart.change.motion).all()
+    assert chart.limits == control_charts.limits(2, 3.2) != control_charts.limits(3, 3.2)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_blind_direction_is_no_freedom(rng, turned):
+    """Along an axis or aslant, however small the directions are that are seen; sigmas as of a check, beside a calibration's."""
+    axes = np.linalg.qr(rng.standard_normal((6, 6)))[0] if turned else np.eye(6)
+    for variances, shown in (([1, 1, 1, 1, 1, 0], 5), ([1, 1, 1, 1, 1, 1e-4], 6), ([1, 0, 1, 0, 1, 1], 4)):
+        unit = np.outer(SIGMA["cam2"], SIGMA["cam2"])
+        assert control_charts.freedom(axes * variances @ axes.T * unit) == shown
+
+
+def test_the_same_recording_checked_again_is_no_other_day(rng):
+    """Of 20 rigs whose third day is 3 sigma off, checked 10 times more: taken for days, which differ by more, more alarm."""
+    out = {1e-8: 0, 1e-3: 0}
+    for _ in range(20):
+        course = estimates(rng, "target", 3, 0.1, np.array([0.0, 0.0, 3.0]))
+        log = logged("target", course)
+        alone = control_charts.charts(log, 3.2)[0]
+        for off, repeated in ((1e-8, 10), (1e-3, 0)):
+            moved = course[-1].motion + off * SIGMA["target"] * rng.standard_normal((10, 3))
+            again = [course[-1].model_copy(update={"motion": tuple(one)}) for one in moved]
+            chart = control_charts.charts([*log, *logged("target", again, 3)], 3.2)[0]
+            assert len(chart.repeated) == repeated and len(chart.times) == 13 - repeated
+            assert chart.times == alone.times or not repeated
+            out[off] += chart.out
+    assert out[1e-3] >= out[1e-8] + 4
+
+
+def test_a_recording_checked_twice_alone_makes_no_chart(rng):
+    """Nor does another covariance of the same motion count as the same recording."""
+    one = estimates(rng, "clock", 1)[0]
+    surer = one.model_copy(update={"own": [[0.9 * one.own[0][0]]]})
+    assert control_charts.charts(logged("clock", [one, one]), 3.2) == []
+    assert len(control_charts.charts(logged("clock", [one, surer]), 3.2)[0].times) == 2
