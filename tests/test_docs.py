@@ -18,6 +18,7 @@ from recon.capture.manifest import Manifest
 from recon.files import meshes
 from recon.model.boards import Board
 from recon.segmentation import containment
+from sonotwin.choices import read_rig
 from sonotwin.cli import VERBS, main
 from sonotwin.config import load
 from tests.twin.small_rigs import half, half_as_fields
@@ -212,6 +213,19 @@ def test_manifests_of_the_page_are_valid():
     )
     shown = [Manifest.model_validate(json.loads(block)) for block in blocks]
     assert {part.partition("/")[0] for manifest in shown for part in manifest.contents} >= {"board", "sweep"}
+
+
+def test_the_page_has_a_rig_to_begin_with(tmp_path):
+    """It is one as it stands, with both cameras and the projector as it says, and the places of the usual rig."""
+    (block,) = re.findall(r"^```yaml\n(.*?)^```", (ROOT / "docs" / "identify.md").read_text(encoding="utf-8"), re.M | re.S)
+    (tmp_path / "our_rig.yaml").write_text(block)
+    own, usual = read_rig(tmp_path / "our_rig.yaml"), read_rig()
+    for name in ("cam1", "cam2"):
+        camera = getattr(own, name)
+        assert (camera.optics.size, camera.sensor.pixel_um, camera.lens.focus_mm) == ((1920, 1200), 5.86, 600.0)
+        assert camera.optics.device_from_world == getattr(usual, name).optics.device_from_world
+    assert (own.cam1.serial, own.cam2.serial) == (usual.cam1.serial, usual.cam2.serial)
+    assert (own.projector.optics.size, own.projector.wavelength_nm) == ((1920, 1080), 460.0)
 
 
 def test_boards_are_described_field_by_field():

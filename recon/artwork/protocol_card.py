@@ -39,7 +39,7 @@ STEPS = (
         "optics and places; blur, f-number, focus; vignetting of cameras and projector",
         "Go where the outline on the screen is: near, far, to the corners, tilted to all sides. Hold still until it says kept.",
         ("12 poses or more are kept", "rims are sharp, and no white is saturated"),
-        "sonotwin record part=board patterns=gray_alone out=session",
+        "sonotwin record part=board patterns=gray_alone devices=ours.yaml rig=our_rig.yaml out=session",
         True,
     ),
     Step(
@@ -49,7 +49,7 @@ STEPS = (
         "gamma, blur and focus of the projector; flicker, stray light, errors of the shifts",
         "Plaster, or a ball of 10 cm. The program sets the exposure, that of steps 3 and 4, too.",
         ("it says kept", "fringes of 50 DN or more, hardly any saturated"),
-        "sonotwin record part=surface patterns=gray_surface out=session",
+        "sonotwin record part=surface patterns=gray_surface devices=ours.yaml rig=our_rig.yaml out=session",
         True,
     ),
     Step(
@@ -59,7 +59,7 @@ STEPS = (
         "contrast: the projector's black apart from the room's light",
         "Hold black card before the projector's lens. Move nothing else.",
         ("it says kept", "the surface is dark, but not blacker than in step 4"),
-        "sonotwin record part=room out=session",
+        "sonotwin record part=room devices=ours.yaml rig=our_rig.yaml out=session",
         True,
     ),
     Step(
@@ -69,7 +69,7 @@ STEPS = (
         "black level, dark noise, DSNU",
         "Best with a black cloth over the caps.",
         ("it says kept", "all is black, without a brighter edge"),
-        "sonotwin record part=dark out=session",
+        "sonotwin record part=dark devices=ours.yaml rig=our_rig.yaml out=session",
         True,
     ),
     Step(
@@ -79,7 +79,7 @@ STEPS = (
         "electrons a digital number, PRNU",
         "Matt, a hand's breadth before each lens, square to it. The program sets the exposures.",
         ("it says kept", "corners have half of the middle's light or more"),
-        "sonotwin record part=flat out=session",
+        "sonotwin record part=flat devices=ours.yaml rig=our_rig.yaml out=session",
         True,
     ),
     Step(
@@ -94,12 +94,17 @@ STEPS = (
     ),
 )
 BEFORE = (
+    "ours.yaml names your devices: serial numbers, the projector's display. How to write it: docs/live.md, A first session.",
+    "our_rig.yaml describes them: sizes, pixels, lenses, rough places. How to write it: docs/identify.md, A file to begin with.",
     "All devices have been on for 15 minutes.",
     "Room lights are as in use; no daylight.",
     "Focus, aperture and gain are as in use, their rings locked.",
     "Automatic exposure, gain and gamma are off.",
 )
-AFTER = "sonotwin identify rig=our_rig.yaml capture=session out=identified"
+AFTER = (
+    "sonotwin identify capture=session rig=our_rig.yaml tissue=session/us/tissue air=session/us/air steps=session/us/steps "
+    "step_mm=0.2 clip=[U,V,W,H] mm_per_px=[X,Z] frequency_mhz=F out=identified"
+)
 
 
 class _Box(Flowable):
@@ -145,11 +150,11 @@ def _content(width: float) -> list[Flowable]:
     """The card from its top, of a width in points."""
     plain = ParagraphStyle("plain", fontName=FONT, fontSize=9.5, leading=12, textColor=INK)
     small = ParagraphStyle("small", plain, fontSize=8.5, leading=11, textColor=GREY)
-    code = ParagraphStyle("code", plain, fontName="Courier-Bold", fontSize=8, leading=12, textColor=ACCENT)
+    code = ParagraphStyle("code", plain, fontName="Courier-Bold", fontSize=7.8, leading=12, textColor=ACCENT)
     title = ParagraphStyle("title", plain, fontName=BOLD, fontSize=20, leading=25)
     head = ParagraphStyle("head", plain, fontName=BOLD, fontSize=12, leading=15)
     number = ParagraphStyle("number", head, fontSize=22, leading=24, textColor=ACCENT)
-    beside, gap = 0.3 * width, 4.0
+    beside, gap = 0.3 * width, 14.0
     middle = width - MINUTES_WIDTH - beside
     tight = [("VALIGN", (0, 0), (-1, -1), "TOP"), ("TOPPADDING", (0, 0), (-1, -1), 0), ("BOTTOMPADDING", (0, 0), (-1, -1), 1)]
     tight += [("LEFTPADDING", (0, 0), (-1, -1), 0), ("RIGHTPADDING", (0, 0), (-1, -1), 0)]
@@ -157,25 +162,19 @@ def _content(width: float) -> list[Flowable]:
     def ticks(lines: tuple[str, ...], across: float) -> Table:
         return Table([[_Box(), Paragraph(one, plain)] for one in lines], [14, across - 14], style=tight)
 
-    rows = [
-        [
-            [Paragraph(str(k), number), Paragraph(f"{step.minutes} min", small)],
-            [
-                Paragraph(step.name, head),
-                Paragraph(f"{step.record[0].upper()}{step.record[1:]}. {step.hints}", plain),
-                Paragraph(f"{'' if step.command else 'into '}{step.place}", code),
-            ],
-            ticks(step.right, beside),
-        ]
-        for k, step in enumerate(STEPS, start=1)
-    ]
-    grid = [("LINEABOVE", (0, 0), (-1, -1), 0.5, GREY), ("LINEBELOW", (0, -1), (-1, -1), 0.5, GREY)]
-    spaced = [
-        *tight,
-        ("TOPPADDING", (0, 0), (-1, -1), 6),
-        ("BOTTOMPADDING", (0, 0), (-1, -1), 7),
-        ("RIGHTPADDING", (1, 0), (1, -1), gap),
-    ]
+    rows: list[list[object]] = []
+    for k, step in enumerate(STEPS, start=1):
+        text = Paragraph(f"{step.record[0].upper()}{step.record[1:]}. {step.hints}", plain)
+        first = [Paragraph(str(k), number), Paragraph(f"{step.minutes} min", small)]
+        rows.append([first, [Paragraph(step.name, head), text], ticks(step.right, beside)])
+        rows.append(["", Paragraph(f"{'' if step.command else 'into '}{step.place}", code), ""])
+    commands = range(1, len(rows), 2)
+    grid = [("LINEABOVE", (0, k - 1), (-1, k - 1), 0.5, GREY) for k in commands]
+    grid += [("LINEBELOW", (0, -1), (-1, -1), 0.5, GREY)]
+    spaced = [*tight, ("RIGHTPADDING", (1, 0), (1, -1), gap)]
+    for k in commands:
+        spaced += [("SPAN", (0, k - 1), (0, k)), ("SPAN", (1, k), (-1, k)), ("RIGHTPADDING", (1, k), (-1, k), 0)]
+        spaced += [("TOPPADDING", (0, k - 1), (-1, k - 1), 5), ("BOTTOMPADDING", (0, k), (-1, k), 5)]
     written = [[Paragraph(one, small) for one in ("Rig", "Date, name", "Exposure of camera 1 and 2", "Gain")]]
     return [
         Paragraph(TITLE, title),
@@ -190,8 +189,9 @@ def _content(width: float) -> list[Flowable]:
         Paragraph("Then", head),
         Paragraph(AFTER, code),
         Paragraph(
-            "uses steps 1 to 5 as they lie in the folder, those of step 6 by its fields tissue, air and steps, and says how well "
-            "each number is known, or why it isn't.",
+            "Letters stand for your numbers: the B-scan's left, top, width and height in an image, px; mm of a pixel along the "
+            "array and in depth; MHz on the probe. It uses steps 1 to 5 as they lie in the folder, and says how well each number "
+            "is known, or why it isn't. Without step 6, leave all from tissue to frequency_mhz out.",
             plain,
         ),
         Spacer(1, 8),

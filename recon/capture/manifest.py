@@ -14,8 +14,10 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
+from recon.capture.image_formats import SUFFIXES
 from recon.errors import InputError, short, validated
 from recon.files import json_text
+from recon.files.regular import shown
 from recon.model import rig
 from recon.model.boards import Board
 from recon.model.patterns import Axis, Patterns
@@ -28,6 +30,7 @@ TRACK = "track.csv"  # in the folder of a sweep
 BODIES, POSES = "bodies", "poses.csv"  # folder of further bodies, each in a folder of its name with its table of poses
 STAMPS = "timestamps.csv"  # in each device's folder of a sweep
 CAMERAS = ("cam1", "cam2")
+IMAGES_BELOW = ("*", "*/*", "*/*/*")  # where images without a manifest lie: cam1/pose03/07.png at most
 SCANNER = "us"
 
 PartName = str  # "surface", "board", "sweep", or "sweep/NAME": the folder of the part's images
@@ -370,6 +373,10 @@ def read_manifest(folder: Path) -> Manifest:
     for other in (Path(folder) / "capture", Path(folder).parent):  # of what was rendered, given as if recorded; and the reverse
         if not path.exists() and (other / MANIFEST).exists():
             raise InputError(f"{path}: expected a file, found none; is {other} meant?")
+    if not path.parent.exists():
+        raise InputError(f"{shown(path.parent)}: expected a capture, found no such folder")
+    if not path.exists() and any(one.suffix.lower() in SUFFIXES for depth in IMAGES_BELOW for one in path.parent.glob(depth)):
+        raise InputError(f"{shown(path)}: expected a file, found none; `sonotwin describe` makes a capture of images")
     return validated(Manifest, json_text.read(path), path)
 
 

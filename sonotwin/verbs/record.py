@@ -191,11 +191,20 @@ def run(config: Config) -> None:
     console = LineConsole()
     with open_recording(config.out, Path(os.path.realpath(config.out)).name) as recording:
         check_place(config, recording)
+        console.print(f"devices     {in_words(config.devices)}", markup=False)
         with shown(config, console) as (say, show):
             record = sweep if config.part == "sweep" else still
             record(config, recording, console, say, show)
     if config.out.is_dir():  # nothing is left where nothing was kept
         console.print(f"wrote       {config.out}", markup=False)
+
+
+def in_words(devices: AnyDevices) -> str:
+    """Who records: cameras by their numbers, or the twin."""
+    if not isinstance(devices, LiveDevices):
+        return "virtual: a rendered rig, nothing is recorded from hardware"
+    others = [name for name in ("projector", "scanner") if getattr(devices, name) is not None]
+    return f"live: {', '.join([*(f'{name} {camera.serial}' for name, camera in devices.cameras.items()), *others])}"
 
 
 def check_place(config: Config, recording: Recording) -> None:

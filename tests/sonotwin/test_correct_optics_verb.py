@@ -188,7 +188,7 @@ def test_a_ball_bar_tells_the_scale(drifted, bar, tmp_path, capsys):
         (["bars=[BAR,BAR]", "bar_mm=[150.0,0.005]"], "bars: expected each capture once, found one twice"),
         (["bars=[BAR]", "bar_mm=[150.0,150.0]"], "bar_mm: expected a length and its standard deviation, at most 1 % of it"),
         (["bars=[BAR]", "bar_mm=[151.5,0.005]"], "bar_mm: expected a bar's length by calibration and usual drift, found 150."),
-        (["bars=[nowhere]", "bar_mm=[150.0,0.005]"], "nowhere/manifest.json: expected a file, found none"),
+        (["bars=[nowhere]", "bar_mm=[150.0,0.005]"], "nowhere: expected a capture, found no such folder"),
     ],
 )
 def test_a_bar_that_is_none_is_refused(drifted, bar, tmp_path, capsys, fields, complaint):

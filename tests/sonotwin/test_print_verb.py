@@ -1,13 +1,18 @@
 """`sonotwin print`: sheets are written whole, said how to be used, and refused with a way on where they don't fit."""
 
 import re
+import shlex
+from pathlib import Path
 
 import pytest
 import yaml
 
+from recon.artwork.protocol_card import AFTER, STEPS
 from recon.model.rig import Rig
 from sonotwin import choices
 from sonotwin.cli import main
+from sonotwin.config import load
+from sonotwin.verbs import identify, record
 from tests.recon.artwork.rasters import raster
 
 WIDE = "board={kind: chessboard, columns: 9, rows: 6, square_mm: 25}"
@@ -48,6 +53,23 @@ def test_the_protocol_is_a_page_and_refused_on_less_paper(place, capsys):
     said = refusal(capsys, "part=protocol", "paper=[148,210]", "out=small.pdf")
     assert said.startswith("paper: expected 210x279.4 mm or more, upright") and not (place / "small.pdf").exists()
     assert "family: expected none with part=protocol, found 3" in refusal(capsys, "part=protocol", "family=3", "out=small.pdf")
+
+
+def test_commands_of_the_protocol_are_whole(place):
+    """Each is valid once both files are there and letters are numbers: by these devices and this rig, in one folder."""
+    (place / "ours.yaml").write_text("defaults: [basler]\n")
+    (place / "our_rig.yaml").write_text("defaults: [meza2021]\nprojector: {wavelength_nm: 460}\n")
+    for step in [step for step in STEPS if step.command]:
+        _, verb, *fields = shlex.split(step.place)
+        config = load(verb, fields, record.Config)
+        assert config.part == step.name.lower() and config.out == Path("session")
+        assert config.devices.kind == "live" and config.rig.projector.wavelength_nm == 460
+    numbers = AFTER.replace("[U,V,W,H]", "[40,60,320,400]").replace("[X,Z]", "[0.12,0.08]").replace("=F ", "=7.5 ")
+    _, verb, *fields = shlex.split(numbers)
+    config = load(verb, fields, identify.Config)
+    assert config.capture == Path("session") and config.rig.projector.wavelength_nm == 460 and config.step_mm == 0.2
+    into = STEPS[-1].place
+    assert all(folder.startswith("session/us/") and folder in into for folder in (config.tissue, config.air, config.steps))
 
 
 def test_a_board_too_large_is_refused_with_paper_and_lengths_that_fit(place, capsys):

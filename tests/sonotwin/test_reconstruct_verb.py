@@ -166,7 +166,7 @@ def test_a_part_that_can_t_be_used_is_named_and_the_others_are_used(tank, tmp_pa
     (["spacing_mm=200"], "reconstruct: spacing_mm: expected"),
     (["board_length_mm=[240.1,0.03]"], "board_length_mm: expected beside a board that the optics are calibrated by, found none"),
     (["bars=[nowhere]"], "reconstruct: bar_mm: expected beside bars, found nothing"),
-    (["bars=[nowhere]", "bar_mm=[150.0,0.002]"], "nowhere/manifest.json: expected a file, found none"),
+    (["bars=[nowhere]", "bar_mm=[150.0,0.002]"], "nowhere: expected a capture, found no such folder"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(tank, tmp_path, capsys, fields, complaint):
     assert main(["reconstruct", f"capture={tank}", f"out={tmp_path / 'out'}", *fields]) == 2

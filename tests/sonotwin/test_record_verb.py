@@ -198,6 +198,18 @@ def test_a_taken_name_is_refused_before_anything_is_opened(tmp_path, capsys):
     assert "give another name=NAME" in refused(capsys, "part=sweep", "name=scan", f"out={out}")
 
 
+def test_the_first_line_says_which_devices_record(tmp_path, monkeypatch, capsys):
+    """The twin, or a laboratory's by their numbers, before any is opened."""
+    (tmp_path / "ours.yaml").write_text("defaults: [basler]\ncameras: {cam1: {serial: '40012345'}}\nscanner: null\n")
+    monkeypatch.setattr(record, "still", lambda config, recording, console, say, show: say("opens"))
+    for devices, told in (
+        ("virtual", "virtual: a rendered rig, nothing is recorded from hardware"),
+        (tmp_path / "ours.yaml", "live: cam1 40012345, cam2 00000001, projector"),
+    ):
+        assert cli.main(["record", "part=surface", f"devices={devices}", "preview.serve=false", f"out={tmp_path}/session"]) == 0
+        assert capsys.readouterr().out.splitlines() == [f"devices     {told}", "surface     opens"]
+
+
 def test_a_folder_around_a_capture_is_named(tmp_path, capsys):
     with_surface(tmp_path / "demo/capture")
     found = refused(capsys, "part=surface", f"out={tmp_path}/demo")

@@ -240,7 +240,7 @@ def test_results_of_other_commands_are_left_alone(capture, tmp_path, capsys):
         ([], "expected capture, or images with patterns and calibration, found none of them"),
         (["images=a"], "expected capture, or images with patterns and calibration, found images"),
         (["capture=a", "images=b"], "expected capture, or images with patterns and calibration, found both: images"),
-        (["capture=nowhere"], "nowhere/manifest.json: expected a file, found none"),
+        (["capture=nowhere"], "nowhere: expected a capture, found no such folder"),
         (["images=a", "patterns=nowhere.yaml", "calibration=c"], "or a YAML file, found none at nowhere.yaml"),
         (["capture=nowhere", "limits.max_sigma=-1"], "limits.max_sigma"),
     ],

@@ -1,6 +1,7 @@
 """Capture folders come back as written, and whatever is wrong with one is said in one line before anything is written."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -112,7 +113,11 @@ def rewrite(folder: Path, pixels: np.ndarray) -> None:
 
 AN_IMAGE = "expected an image (.png, .bmp, .tif, .tiff, .jpg, .jpeg)"
 FAULTS = {
-    "no manifest": (lambda f: (f / "manifest.json").unlink(), "manifest.json: expected a file, found none"),
+    "no manifest": (
+        lambda f: (f / "manifest.json").unlink(),
+        "manifest.json: expected a file, found none; `sonotwin describe` makes",
+    ),
+    "no folder": (shutil.rmtree, ": expected a capture, found no such folder"),
     "no JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: expected JSON, found "),
     "newer": (
         lambda f: edit(f, lambda m: m.update(schema="sonotwin-capture/2")),
