@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.ndimage import binary_closing, gaussian_filter
+from scipy.ndimage import binary_closing, distance_transform_edt, gaussian_filter
 from scipy.optimize import minimize_scalar
 
 from recon.capture.surface_part import SurfaceCapture
@@ -49,7 +49,8 @@ INSIDE_PX = 4.0  # projector px from an edge, and half a period of the fringes, 
 UNCLIPPED, WINDOW = 0.96, (5, 5)  # of full scale: means of neighbouring px are below where none of them is clipped
 FAR_PX = 64.0  # projector px from an edge, from which on farther ones count no more
 BRIGHT = 95.0  # percentile of the reflectances, which gets
-USUAL = 0.8  # this one, of plaster or paper
+USUAL = 0.8  # this one, of plaster or paper, but for places that are brighter still:
+BRIGHTEST = 99.0  # percentile of the reflectances that is `MOST` at most
 EVEN = 0.5  # reflectance of a first render
 SHARPEST = 2.0  # factor by which the blur of rendering is undone at most
 GAP_PX = 6  # camera px, half the width of gaps that are closed
@@ -59,6 +60,7 @@ LEAST, MOST = 0.03, 0.95  # reflectance of bright places that light between them
 BLOCKS = 8  # of the surface's longer side, and fewest in all; errors of light in the dark go together within one
 CLEAR = 5.0  # times its scatter between blocks, of a gain over the least or the most: 10 to 13 in grooves, 3 at most on a sphere
 AT_END = 0.01  # share of the least or the most reflectance, within which one counts as that
+NEAR = 1e-3  # share of known px around one, by which it is filled
 SLOPE = 0.02  # rad, of the surface's slopes by the points' noise after smoothing
 LEAST_PX, MOST_PX = 0.7, 4.0  # camera px, standard deviation of that smoothing
 BEHIND_MM, CLOTH_MM = 100.0, 5000.0  # distance and size of a black cloth behind it
@@ -208,6 +210,7 @@ def scene_of(
         * exposure.time_s
         * number_per_electron(device.sensor, exposure)
     )
+    light = _with_dark(light)
     white = light.bright - light.dark
     projector, straight = ProjectorOptics.of(rig.projector), tracing.model_copy(update={"room_lux": 0.0, "bounces": 1})
 
@@ -238,7 +241,7 @@ def scene_of(
         cause = "white is clipped everywhere; record with a shorter exposure" if clipped else "the projector lights none of it"
         raise InputError(f"{shots.name}: expected a surface under white below {UNCLIPPED:.0%} of full scale, found that {cause}")
     usable = known & inside if (known & inside).any() else known  # at borders and steps reflectances are wrong
-    scale = float(np.percentile(albedo[usable], BRIGHT)) / USUAL
+    scale = max(float(np.percentile(albedo[usable], BRIGHT)) / USUAL, float(np.percentile(albedo[usable], BRIGHTEST)) / MOST)
     albedo = np.clip(_filled(np.where(known, albedo / np.float32(scale), np.float32(np.nan))), 0, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         sharper = np.nan_to_num(white / scale / lit(albedo), nan=1.0, posinf=1.0)
@@ -249,7 +252,8 @@ def scene_of(
     for _ in range(ROUNDS if tracing.bounces > 1 else 0):
         orders = [SeenLight(*(_but_for(albedo, np.float32(scale) * side) for side in one)) for one in again(albedo)]
         bright = float(np.percentile(albedo[usable], BRIGHT))
-        times, known_by = reflectance_factor(beyond, albedo * share, [one.dark for one in orders], usable, bright)
+        usual = min(USUAL, MOST / float(np.percentile(albedo[usable], BRIGHTEST)) * bright)
+        times, known_by = reflectance_factor(beyond, albedo * share, [one.dark for one in orders], usable, bright, usual)
         more, dark = (sum(times**k * one[side] for k, one in enumerate(orders, 1)) for side in range(2))
         left = np.nan_to_num(white / (direct + more - dark), nan=1.0, posinf=1.0)
         direct, between, scale = direct * left, dark * left, scale / times
@@ -267,6 +271,16 @@ def scene_of(
     )
 
 
+def _with_dark(light: SeenLight) -> SeenLight:
+    """Light with a share of the bright as around where no image was dark, as under a word of Gray code that is all ones."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = light.dark / light.bright
+    if not np.isfinite(share).any():
+        return light
+    unknown = np.isnan(light.dark) & np.isfinite(light.bright)
+    return light._replace(dark=np.where(unknown, _filled(share) * light.bright, light.dark))
+
+
 def _but_for(base: Image, light: Image) -> Image:
     """Light : (h, w) that is smooth but for what it has in common with a base, without its noise; NaN where that isn't light."""
     known = np.isfinite(light) & (base > 0)
@@ -277,7 +291,7 @@ def _but_for(base: Image, light: Image) -> Image:
 
 
 def reflectance_factor(
-    beyond: Image, even: Image, dark: list[Image], known: NDArray[np.bool_], bright: float
+    beyond: Image, even: Image, dark: list[Image], known: NDArray[np.bool_], bright: float, usual: float
 ) -> tuple[float, KnownBy]:
     """Factor of the reflectance by which light between places explains what is in dark stripes, beside an even room's.
 
@@ -288,10 +302,11 @@ def reflectance_factor(
     Parameters
     ----------
     bright : reflectance of bright places that goes with a factor of 1
+    usual : of bright places, where light between them doesn't tell it
     """
     told = known & np.isfinite(beyond) & np.isfinite(dark).all(axis=0)
     if not told.any():
-        return USUAL / bright, "assumed"
+        return usual / bright, "assumed"
 
     def unexplained(times: float) -> Array:
         rest = beyond[told] - sum(times**k * one[told] for k, one in enumerate(dark, 1))
@@ -312,7 +327,7 @@ def reflectance_factor(
         return np.count_nonzero(number) >= BLOCKS and bool(gain.sum() > CLEAR * scatter)
 
     if not clearly_less_than(least) and not clearly_less_than(most):
-        return USUAL / bright, "assumed"
+        return usual / bright, "assumed"
     at_end: list[KnownBy] = [name for name, end in (("or less", least), ("or more", most)) if abs(best / end - 1) < AT_END]
     return best, at_end[0] if at_end else "found"
 
@@ -351,12 +366,12 @@ def _backdrop(mesh: trimesh.Trimesh) -> Thing:
 
 
 def _filled(values: Image) -> Image:
-    """Values : (h, w) with means of near ones in place of unknown ones."""
+    """Values : (h, w), some known, with means of near ones in place of unknown ones; farther off the mean at the nearest."""
     known = np.isfinite(values)
-    near = gaussian_filter(np.where(known, values, 0), MOST_PX) / np.maximum(
-        gaussian_filter(known.astype(np.float32), MOST_PX), 1e-6
-    )
-    return np.where(known, values, near).astype(np.float32)
+    share = gaussian_filter(known.astype(np.float32), MOST_PX)
+    near = gaussian_filter(np.where(known, values, 0), MOST_PX) / np.maximum(share, NEAR)
+    row, column = np.asarray(distance_transform_edt(share < NEAR, return_distances=False, return_indices=True))
+    return np.where(known, values, near[row, column]).astype(np.float32)
 
 
 def _black_dn(rig: Rig, camera: CameraName, exposure: Exposure) -> float:

@@ -18,6 +18,7 @@ from scenes.scene_types import Material, Scene, Thing
 from tests.twin.small_rigs import cropped
 from twin.optics import seen_surface
 from twin.optics.light_transport import Tracing
+from twin.optics.seen_surface import SeenLight
 from twin.optics.surface_session import Shooting, calibration_of, shoot
 
 
@@ -69,6 +70,16 @@ def test_light_of_clipped_stripes_is_that_of_the_fringes():
     np.testing.assert_allclose(light.bright[known], 12 + albedo[known], rtol=0.01)
 
 
+def test_unknown_places_are_as_bright_as_what_is_near():
+    """In a gap of 60 px, farther than any blur reaches, the values on either side; and dark light in proportion to the bright."""
+    values = np.broadcast_to(np.where(np.arange(120) < 60, np.float32(0.2), np.float32(0.8)), (40, 120)).copy()
+    values[:, 30:90] = np.nan
+    np.testing.assert_allclose(seen_surface._filled(values)[:, [29, 40, 55, 64, 80, 90]], [[0.2, 0.2, 0.2, 0.8, 0.8, 0.8]] * 40)
+    bright = np.broadcast_to(np.linspace(40, 100, 120, dtype=np.float32), (40, 120))
+    dark = np.where(np.isnan(values), np.nan, np.float32(0.05) * bright)
+    np.testing.assert_allclose(seen_surface._with_dark(SeenLight(bright, dark)).dark, 0.05 * bright, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("truth", "light", "factor", "known_by"),
     [
@@ -91,7 +102,7 @@ def test_light_in_the_dark_gives_the_reflectance_or_nothing(rng, truth, light, f
     once = np.float32(light) * np.linspace(0, 1, 120, dtype=np.float32) * np.ones((100, 1), np.float32)
     even, known = np.full(once.shape, 50, np.float32), np.ones(once.shape, bool)
     beyond = 3 + truth * once + truth**2 * 0.1 * once + 0.4 * rng.standard_normal(once.shape) + 0.2 * blotches
-    found = seen_surface.reflectance_factor(np.float32(beyond), even, [once, 0.1 * once], known, seen_surface.USUAL)
+    found = seen_surface.reflectance_factor(np.float32(beyond), even, [once, 0.1 * once], known, bright=0.8, usual=0.8)
     assert found[1] == known_by and found[0] == pytest.approx(factor, abs=0.06)
 
 
