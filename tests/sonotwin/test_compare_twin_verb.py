@@ -84,7 +84,7 @@ def test_what_does_not_fit_is_refused(small, capture, tmp_path, capsys):
     rig_file.write(tmp_path / "rig.yaml", small, {}, "a test")
     rig = f"rig={tmp_path / 'rig.yaml'}"
     for given, told in (
-        ([f"capture={tmp_path / 'nothing'}", rig], "manifest.json"),
+        ([f"capture={tmp_path / 'nothing'}", rig], "no such folder"),
         ([f"capture={capture}"], "256x208"),
         ([f"capture={capture}", rig, "camera=cam2"], "expected surface images of cam2"),
     ):
