@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import kendalltau
+from scipy import stats
 
 from recon.identification.photon_transfer import LIMITS as TRANSFER
 from recon.identification.photon_transfer import ROUNDING, PhotonTransfer, TileNoise
@@ -77,7 +77,7 @@ def describe_drift(flats: Sequence[NDArray]) -> str | None:
     for frames in flats:
         light = frames.mean(axis=(1, 2))
         change = light.max() / max(light.min(), 1.0) - 1
-        ordered = change > LIMITS.drift and kendalltau(np.arange(len(light)), light).pvalue < LIMITS.ordered
+        ordered = change > LIMITS.drift and stats.kendalltau(np.arange(len(light)), light).pvalue < LIMITS.ordered
         if ordered or change > LIMITS.scattered:
             course = "drift" if ordered else "scatter"
             cause = "auto exposure, auto gain or a cold lamp: fix them, let the lamp warm up; or give processed=true"
