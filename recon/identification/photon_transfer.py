@@ -7,6 +7,7 @@ What a lamp changes from frame to frame is smooth, or follows the scene: it is f
 Source: EMVA 1288, Release 4.0 (variance against mean); Sheppard 1898 (variance of rounding).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,6 +53,12 @@ class TileNoise(NamedTuple):
         Array  # (t, 5) correlation of pixels' noise with that of the next along rows, columns, diagonals, of the next across the
     )
     # borders of blocks of 8 px, and of those 4 px away; 0 in the mean over tiles if the noise is white
+
+
+def joined(parts: Iterable[TileNoise | None]) -> TileNoise | None:
+    """Tiles of several parts in one; None if no part has any."""
+    found = [one for one in parts if one is not None]
+    return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,7 @@ def noise_of_patterns(images: NDArray, patterns: Patterns, bits: int) -> TileNoi
         elif isinstance(part, Fringes) and has_free_dimensions(part):
             measure = noise_of_fringes if part.waveform == "sine" else noise_of_binary_fringes
             found.append(measure(images[place], part.shifts, bits))
-    return TileNoise(*map(np.concatenate, zip(*found, strict=True))) if found else None
+    return joined(found)
 
 
 def has_free_dimensions(part: AnyPart) -> bool:

@@ -22,6 +22,7 @@ from recon.identification.estimates import Estimate, Findings
 from recon.identification.photon_transfer import (
     PhotonTransfer,
     TileNoise,
+    joined,
     noise_of_flat,
     noise_of_patterns,
     transfer_line,
@@ -128,10 +129,14 @@ def identify_sensor(
         `CAMERA.sensor.FIELD` for all fields but the pixel's size. Of images that aren't raw no field is known.
     """
     n = camera + ".sensor."
-    processing = None if settings.processed else _processing(settings, flats, sequences)
+    by_flats = joined(noise_of_flat(frames, settings.bits) for frames in flats)
+    by_patterns = joined(noise_of_patterns(stack.images, stack.patterns, settings.bits) for stack in sequences)
+    processing = None if settings.processed else describe_drift(flats) or _processing(by_flats, by_patterns)
     if processing is not None:
         return without_raw_images(camera, processing)
-    line, seen = _line(settings, flats, sequences)
+    # Fringes of a scene leave some tenths of a per cent in the variance, which many flat frames would be known better than.
+    noise = by_patterns if by_flats is None else by_flats
+    line, seen = (None, "") if noise is None else (transfer_line(noise), _names(settings, flats, sequences))
     unknown = {
         n + "quantum_efficiency": "images count electrons; the light's power on a pixel isn't known, so photons aren't",
         n + "adc_bits": f"images of {settings.bits} bits leave out what the ADC has below them: see the data sheet",
@@ -186,42 +191,21 @@ def _range(settings: ImageSettings, black_level_dn: float) -> float:
     return gain * 2.0 ** (settings.bits - 8) * (256 - black_level_dn)
 
 
-def _processing(settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]) -> str | None:
-    """What was done to the images, in words, by flat frames or by patterns."""
-    drift = describe_drift(flats)
-    if drift is not None:
-        return drift
-    by_flats = [noise_of_flat(frames, settings.bits) for frames in flats]
-    by_patterns = [noise_of_patterns(stack.images, stack.patterns, settings.bits) for stack in sequences]
-    for tiles, flat in ((by_flats, True), ([one for one in by_patterns if one is not None], False)):
-        if tiles:
-            noise = TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))
-            why = describe_processing(noise, transfer_line(noise), by_flats=flat)
-            if why is not None:
-                return why
+def _processing(by_flats: TileNoise | None, by_patterns: TileNoise | None) -> str | None:
+    """What was done to the images, in words, by noise of flat frames or of patterns."""
+    for noise, flat in ((by_flats, True), (by_patterns, False)):
+        why = None if noise is None else describe_processing(noise, transfer_line(noise), by_flats=flat)
+        if why is not None:
+            return why
     return None
 
 
-def _line(
-    settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]
-) -> tuple[PhotonTransfer | None, str]:
-    """Photon transfer of flat frames, or of patterns where there are none, and their names.
-
-    Fringes of a scene leave some tenths of a per cent in the variance, which many flat frames would be known better than.
-    """
-    if flats:
-        tiles, names = [noise_of_flat(frames, settings.bits) for frames in flats], f"{sum(map(len, flats))} flat frames"
-    else:
-        found = [noise_of_patterns(stack.images, stack.patterns, settings.bits) for stack in sequences]
-        tiles, names = (
-            [one for one in found if one is not None],
-            f"{sum(len(stack.images) for stack in sequences)} images of patterns",
-        )
-    if not tiles:
-        return None, ""
+def _names(settings: ImageSettings, flats: Sequence[NDArray], sequences: Sequence[PatternStack]) -> str:
+    """Of the images by which a line was found."""
+    patterns = f"{sum(len(stack.images) for stack in sequences)} images of patterns"
     gain = " at gain 1, as the camera's isn't known" if settings.gain is None else ""
     gain += " taken for raw ones" if settings.processed else ""
-    return transfer_line(TileNoise(*map(np.concatenate, zip(*tiles, strict=True)))), names + gain
+    return (f"{sum(map(len, flats))} flat frames" if flats else patterns) + gain
 
 
 def _without_dark(n: str, settings: ImageSettings, line: PhotonTransfer | None, seen: str, flats: Sequence[NDArray]) -> Findings:

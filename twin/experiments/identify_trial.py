@@ -99,19 +99,18 @@ def identify_recorded(
     rig: Rig, conditions: Conditions, array: Transducer, out: Path, poses_seed: int, seed: int
 ) -> tuple[Rig, Findings]:
     """Record a rig's captures in a folder, and identify it from these and its sheet."""
+    by_light = record_optics(rig, conditions, out, poses_seed, seed)
+    record_sweeps(rig, array, out, seed)
+    return rig_step.identify(rig_step.Settings(**by_light, **scanner_sheet(array, seed)))[:2]
+
+
+def record_optics(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> dict[str, Any]:
+    """Record a surface, a board and frames in a folder; returns the fields of their identification, by the rig's sheet."""
     exposures = record_surface(rig, conditions, out, seed)
     record_board(rig, conditions, out, poses_seed, seed)
     record_frames(rig, exposures, out, seed)
-    record_sweeps(rig, array, out, seed)
-    chosen = rig_step.Settings(
-        capture=out / CAPTURE,
-        rig=sheet_of(rig),
-        dark=out / "dark",
-        flat=out / "flat",
-        adc_bits=rig.cam1.sensor.adc_bits,
-        **scanner_sheet(array, seed),
-    )
-    return rig_step.identify(chosen)[:2]
+    frames = {"dark": out / "dark", "flat": out / "flat", "adc_bits": rig.cam1.sensor.adc_bits}
+    return {"capture": out / CAPTURE, "rig": sheet_of(rig), **frames}
 
 
 def with_scanner(rig: Rig, array: Transducer) -> Rig:

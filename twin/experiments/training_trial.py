@@ -17,8 +17,7 @@ from recon.session import rig_step
 from twin.conditions import Conditions
 from twin.experiments import drawn_rig
 from twin.experiments.experiment_runs import Experiment, Settings
-from twin.experiments.identify_trial import record_board, record_frames, record_surface, sheet_of
-from twin.session import CAPTURE
+from twin.experiments.identify_trial import record_optics
 from twin.shooting import Quality
 from twin.tracking import dataset_shards
 from twin.tracking.sampling_ranges import DataRanges
@@ -81,12 +80,7 @@ def draw_laboratory(seed: int) -> Laboratory:
 
 def identified(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> Rig:
     """Identify cameras and projector from captures that are recorded in a folder, and the rig's sheet."""
-    exposures = record_surface(rig, conditions, out, seed)
-    record_board(rig, conditions, out, poses_seed, seed)
-    record_frames(rig, exposures, out, seed)
-    sheet, bits = sheet_of(rig), rig.cam1.sensor.adc_bits
-    chosen = rig_step.Settings(capture=out / CAPTURE, rig=sheet, dark=out / "dark", flat=out / "flat", adc_bits=bits)
-    return rig_step.identify(chosen)[0]
+    return rig_step.identify(rig_step.Settings(**record_optics(rig, conditions, out, poses_seed, seed))).rig
 
 
 def rendered(rig: Rig, ranges: DataRanges, samples: int, seed: int, out: Path) -> Path:
