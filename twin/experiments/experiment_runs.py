@@ -52,7 +52,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "training": "twin.experiments.training_trial",
 }
 DIGITS = 6  # significant, of figures
-PACKAGES = ("recon", "scenes", "twin", "trainers")  # by whose code figures are made
+PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "mitsuba", "drjit", "onnxruntime")
 
 
@@ -122,6 +122,8 @@ class Experiment:
     limit: str = "closed form"  # what these are
     counts: tuple[str, ...] = ()  # figures that a study adds up over its trials
     predict: Callable[[Settings, int], Metrics] | None = None  # some of the figures by formulas, in milliseconds
+    packages: tuple[str, ...] = ()  # by whose code its figures are made, beside PACKAGES
+    libraries: tuple[str, ...] = ()  # distributions of others, beside LIBRARIES
 
 
 def experiment(name: str) -> Experiment:
@@ -145,24 +147,34 @@ def read_by(name: str, settings: Settings) -> dict[str, Any]:
 
 
 @cache
-def version() -> str:
-    """Digest of all that a trial's figures depend on beside its settings and its seed: code, libraries and the ray tracer's."""
-    libraries = {name: importlib.metadata.version(name) for name in LIBRARIES}
-    content = json.dumps([code_digest(*PACKAGES), libraries, prepare()], sort_keys=True)
+def version(packages: tuple[str, ...] = (), libraries: tuple[str, ...] = ()) -> str:
+    """Digest of all that figures depend on beside settings and seed: code, libraries and the ray tracer's.
+
+    packages, libraries : beside PACKAGES and LIBRARIES
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If a library isn't installed.
+    """
+    versions = {name: importlib.metadata.version(name) for name in LIBRARIES + libraries}
+    content = json.dumps([code_digest(*PACKAGES, *packages), versions, prepare()], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:12]
 
 
 def digest(name: str, settings: Settings, seed: int) -> str:
     """Name of a trial: by all that its figures depend on."""
-    content = json.dumps([version(), name, read_by(name, settings), seed], sort_keys=True)
+    of = experiment(name)
+    content = json.dumps([version(of.packages, of.libraries), name, read_by(name, settings), seed], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:20]
 
 
 @contextmanager
-def same_code(asked: str, here: str) -> Iterator[None]:
+def same_code(asked: str, here: str, packages: tuple[str, ...] = ()) -> Iterator[None]:
     """Measure figures that are kept under a name which is made of the code: it must be so here, before and afterwards.
 
     asked, here : the name as who asks made it, and as it is on this machine
+    packages : by whose code figures are made, beside PACKAGES
 
     Raises
     ------
@@ -176,7 +188,7 @@ def same_code(asked: str, here: str) -> Iterator[None]:
             f"engine: {expected}, found others at {gethostname()}; was code edited since the run began? start it again"
         )
     yield
-    if not is_unchanged(*PACKAGES):
+    if not is_unchanged(*PACKAGES, *packages):
         advice = "start it again, in a copy of the code if you go on editing; what was kept before stays"
         raise InputError(f"engine: {expected}, found it edited meanwhile at {gethostname()}; {advice}")
 
@@ -192,8 +204,9 @@ def run_trial(key: str, name: str, settings: Settings, seed: int) -> tuple[str, 
     InputError
         As `same_code` does.
     """
-    with same_code(key, digest(name, settings, seed)):
-        return key, _figures(experiment(name).measure, settings, seed)
+    of = experiment(name)
+    with same_code(key, digest(name, settings, seed), of.packages):
+        return key, _figures(of.measure, settings, seed)
 
 
 def predict_trial(name: str, settings: Settings, seed: int) -> Metrics | str:

@@ -2,7 +2,8 @@
 
 The rig is drawn at random and identified from its own captures. Its laboratory has a light and a speed of the hand, which any
 film shows: narrow sets have these, the twin's own cameras and no gain; wide ones have the ranges of conf/dataset.yaml as they
-are. Frames that are tried are narrow ones, of bodies and surroundings that no set has.
+are. Frames that are tried are narrow ones, of bodies and surroundings that no set has. Each trial has bodies, surroundings and
+crops of its own, the same for each twin.
 """
 
 from pathlib import Path
@@ -60,11 +61,12 @@ def measure(settings: Settings, seed: int) -> Metrics:
     with TemporaryDirectory() as named:
         out = Path(named)
         found_rig = identified(rig, conditions, out, settings.poses.seed + seed, seed)
-        tried = rendered(rig, laboratory.narrowed(ranges, rig), TRIED, 1, out / "tried")
+        tried = rendered(rig, laboratory.narrowed(ranges, rig), TRIED, 2 * seed + 1, out / "tried")
         for name, twin in {"usual": settings.rig, "identified": found_rig, "true": rig}.items():
             for how, chosen in {"wide": ranges, "narrow": laboratory.narrowed(ranges, twin)}.items():
-                learnt = rendered(twin, chosen, SAMPLES, 0, out / f"{name}_{how}")
-                trained = [short_training.trained_on(learnt, STEPS, k, SCALES[how]) for k in range(TRAININGS)]
+                learnt = rendered(twin, chosen, SAMPLES, 2 * seed, out / f"{name}_{how}")
+                crops = range(seed * TRAININGS, (seed + 1) * TRAININGS)
+                trained = [short_training.trained_on(learnt, STEPS, k, SCALES[how]) for k in crops]
                 found[how, name] = [short_training.figures(network, tried) for network in trained]
         shipped = short_training.figures(short_training.shipped(), tried)
     before = {f"{figure}_shipped": value for figure, value in shipped.items()}
@@ -116,4 +118,6 @@ EXPERIMENT = Experiment(
         for name in ("usual", "identified")
     },
     "trained on the true rig's frames",
+    packages=("trainers",),
+    libraries=("torch", "kornia", "lightning-fabric"),
 )

@@ -44,6 +44,28 @@ def test_gains_are_of_the_means_of_trainings():
     assert set(training_trial.EXPERIMENT.limits) | set(training_trial.EXPERIMENT.limits.values()) <= set(figures)
 
 
+def test_each_trial_has_its_own_bodies_and_crops(settings, monkeypatch):
+    """Otherwise trials err alike by their few bodies, and means over them look too sure. Within a trial the twins share them."""
+    pytest.importorskip("torch")
+    from trainers import short_training
+
+    taken = {}
+    figures = dict.fromkeys(training_trial.FIGURES, 0.0)
+    monkeypatch.setattr(training_trial, "identified", lambda rig, *_: rig)
+    monkeypatch.setattr(short_training, "shipped", lambda: None)
+    monkeypatch.setattr(short_training, "figures", lambda *_: figures)
+    for seed in (0, 1):
+        sets, crops = [], []
+        monkeypatch.setattr(training_trial, "rendered", lambda rig, ranges, samples, seed, out, to=sets: to.append(seed))
+        monkeypatch.setattr(short_training, "trained_on", lambda folder, steps, seed, scales, to=crops: to.append(seed))
+        training_trial.measure(settings, seed)
+        tried, *learnt = sets
+        assert tried not in learnt and len(learnt) == 6 and len(set(learnt)) == 1
+        assert len(crops) == 6 * training_trial.TRAININGS and len(set(crops)) == training_trial.TRAININGS
+        taken[seed] = {tried, *learnt}, set(crops)
+    assert not taken[0][0] & taken[1][0] and not taken[0][1] & taken[1][1]
+
+
 @pytest.mark.slow
 def test_a_twin_that_is_the_rig_gains_all_that_can_be_gained(settings, monkeypatch):
     """With the true rig for the identified one both sets, and so both networks, are the same; those of another rig aren't."""

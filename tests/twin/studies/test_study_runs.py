@@ -1,5 +1,6 @@
 """Trials are done once, in any order, by any engine, and give the same table."""
 
+import importlib.metadata
 import json
 import math
 
@@ -129,7 +130,7 @@ def test_a_trials_name_is_all_that_its_figures_depend_on(settings, monkeypatch):
     elsewhere = settings.model_copy(update={"film": settings.film.model_copy(update={"frames": 77})})
     assert planned(elsewhere, {SPEED: [10]}, (0,))[0].key == key
     assert experiment_runs.digest("chain", settings, 0) != experiment_runs.digest("laboratory", settings, 0)
-    monkeypatch.setattr(experiment_runs, "version", lambda: "of other code")
+    monkeypatch.setattr(experiment_runs, "version", lambda *of_its_own: "of other code")
     others.append(planned(settings, {SPEED: [10]}, (0,)))
     assert len({key, *(one.key for (one,) in others)}) == 4
 
@@ -150,10 +151,33 @@ def test_a_version_is_that_of_code_libraries_and_the_ray_tracer(monkeypatch):
     assert experiment_runs.version() is experiment_runs.version() and len(found[0]) == 12
 
 
+def test_what_one_experiment_alone_depends_on_is_in_its_trials_alone(settings, monkeypatch):
+    """Other trainers or another torch void what training gave, and the figures of no other study."""
+    training, names = experiment_runs.experiment("training"), ("training", "chain")
+    version, installed, code = experiment_runs.version, importlib.metadata.version, experiment_runs.code_digest
+    for name in training.libraries:
+        pytest.importorskip(name.replace("-", "_"))
+
+    def keys():
+        version.cache_clear()
+        return [experiment_runs.digest(name, settings, 0) for name in names]
+
+    before = keys()
+    for place, name, other in (
+        (importlib.metadata, "version", lambda library: "0.1" if library == "torch" else installed(library)),
+        (experiment_runs, "code_digest", lambda *packages: code(*packages) + ("1" if "trainers" in packages else "")),
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, other)
+            training_key, chain = keys()
+            assert training_key != before[0] and chain == before[1]
+    assert keys() == before
+
+
 def test_workers_of_another_version_refuse(settings, place, monkeypatch):
     """Their figures would be kept under the name of this machine's."""
     trials = planned(settings, {SPEED: [10]}, (0,))
-    monkeypatch.setattr(experiment_runs, "version", lambda: "of other code")
+    monkeypatch.setattr(experiment_runs, "version", lambda *of_its_own: "of other code")
     with pytest.raises(InputError, match="engine: expected workers with the code and the libraries of this machine, found"):
         measured(place, trials)
     assert not list(place.trials.iterdir())
