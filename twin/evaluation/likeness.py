@@ -327,20 +327,27 @@ def _rings_of(side: Taken, both: Mask) -> tuple[Array, int] | None:
 
 
 def harmonics(side: Taken, both: Mask) -> NDArray[np.complex128] | None:
+    """Harmonics of the first fringes that show any, of five steps or more."""
+    for part, images in side.fringes():
+        if part.steps >= 5:
+            return harmonics_of(part.shifts, images[:, both].astype(float))
+    return None
+
+
+def harmonics_of(shifts: Array, values: Array) -> NDArray[np.complex128]:
     """Temporal harmonics that follow the fringes, from the second on, of their modulation, in the mean over pixels.
 
     A gamma makes them; errors of frames, noise and edges have no phase in common with the fringes and fall out.
+
+    Parameters
+    ----------
+    shifts : (n,) rad, n >= 5
+    values : (n, pixels) DN
     """
-    for part, images in side.fringes():
-        highest = min(HARMONICS, (part.steps - 1) // 2)
-        if highest < 2:
-            continue
-        values = images[:, both].astype(float)
-        waves = np.exp(-1j * np.arange(1, highest + 1)[:, None] * part.shifts) * 2 / part.steps
-        lines = waves @ values
-        turned = lines * np.exp(-1j * np.arange(1, highest + 1)[:, None] * np.angle(lines[0]))
-        return turned[1:].mean(axis=1) / np.abs(lines[0]).mean()
-    return None
+    orders = np.arange(1, min(HARMONICS, (len(shifts) - 1) // 2) + 1)[:, None]
+    lines = np.exp(-1j * orders * shifts) * 2 / len(shifts) @ values
+    turned = lines * np.exp(-1j * orders * np.angle(lines[0]))
+    return turned[1:].mean(axis=1) / np.abs(lines[0]).mean()
 
 
 def _as_blurred(found: NDArray[np.complex128] | None, patterns: Patterns, edges: Profile | None) -> NDArray[np.complex128] | None:
@@ -462,14 +469,13 @@ def repeated(side: Taken, both: Mask) -> float:
 
     Source: Spearman 1910, Brown 1910.
     """
-    follow = harmonics(side, both)
     for part, images in side.fringes():
-        if part.steps < MIN_STEPS_FOR_NOISE or part.steps % 2 or follow is None:
+        if part.steps < MIN_STEPS_FOR_NOISE or part.steps % 2:
             continue
         values = images[:, both].astype(float)
         _, c, s = np.tensordot(pseudo_inverse(part.shifts), values, 1)
         phase = np.angle(c + 1j * s) + part.shifts[:, None]
-        for k, share in enumerate(follow, 2):
+        for k, share in enumerate(harmonics_of(part.shifts, values), 2):
             values -= np.hypot(c, s) * (share * np.exp(1j * k * phase)).real
         halves = [np.tensordot(pseudo_inverse(part.shifts[first::2]), values[first::2], 1)[1:] for first in (0, 1)]
         r = float(np.corrcoef(*(np.hypot(*half) for half in halves))[0, 1])

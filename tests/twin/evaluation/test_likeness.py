@@ -91,6 +91,23 @@ def test_halves_of_the_steps_tell_how_alike_two_captures_are(rng, third):
     assert found["modulation_repeated"].value == pytest.approx(found["modulation_correlation"].value, abs=0.01)
 
 
+def test_harmonics_of_other_fringes_stay_out_of_halves_of_the_steps(rng):
+    """Six steps before them, of another pitch and with a third harmonic of the other sign, change nothing."""
+    fringes, before = SEQUENCE.parts[0], Fringes(pitch=64, steps=6)
+    x = 60.3 + 2.37 * np.arange(SHAPE[1])[None] + 0.01 * np.arange(SHAPE[0])[:, None]
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    albedo, images = 40 + 30 * np.sin(0.02 * v) * np.cos(0.013 * u), []
+    for part, third in ((before, -0.2), (fringes, 0.2)):
+        phase = 2 * np.pi * x / part.pitch + part.shifts[:, None, None]
+        images.append(noisy(90 + albedo * (np.cos(phase) + third * np.cos(3 * phase)), rng, 0.3))
+    side = taken(noisy(light_of()[0], rng))
+    both = np.ones(SHAPE, bool)
+    alone = replace(side, images=images[1], patterns=SEQUENCE.model_copy(update={"parts": (fringes,)}))
+    after = replace(side, images=np.concatenate(images), patterns=SEQUENCE.model_copy(update={"parts": (before, fringes)}))
+    assert 0.8 < likeness.repeated(alone, both) < 0.99
+    assert likeness.repeated(after, both) == pytest.approx(likeness.repeated(alone, both), rel=1e-9)
+
+
 @pytest.mark.parametrize("gain", [0.03, 0.052])
 def test_noise_of_another_gain_is_found_and_named(rng, gain):
     """Variances are 1 + gain * level, with 1/12 of rounding: their ratio is that in each level, and the gain's is the cause."""
