@@ -191,10 +191,9 @@ class Manifest(rig.Part):
         """The capture's name: its own, or that of its folder."""
         return self.name or folder.resolve().name
 
-    @property
-    def newest_day(self) -> date | None:
-        """On which the newest part was recorded; None if no part says."""
-        return max((day for name in self.contents if (day := self.part(name).day) is not None), default=None)
+    def days_of(self, parts: Iterable[PartName]) -> dict[PartName, date]:
+        """Days on which parts were recorded; without those that don't say."""
+        return {name: day for name in parts if (day := self.part(name).day) is not None}
 
     @model_validator(mode="after")
     def _one_or_named(self) -> "Manifest":

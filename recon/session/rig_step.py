@@ -17,7 +17,7 @@ from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
 from recon.capture.board_part import BoardCapture
 from recon.capture.images import image_files, read_images
-from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest
+from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest, sweep_part
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError, one_line
 from recon.files import atomic, yaml_text
@@ -70,7 +70,8 @@ class Settings(scanner_step.Fields):
     conditions: Part | None = None
     """the conditions to begin with, such as an earlier conditions.yaml: what isn't measured stays as they have it"""
     day: date | None = None
-    """of the capture, such as 2026-11-30; null: that on which its newest part was recorded, else that of manifest.json, in UTC"""
+    """of the capture, such as 2026-11-30; null: of those of its parts that the rig is identified from, on which the newest was
+    recorded, else that of manifest.json, in UTC"""
     calibration: Path | None = None
     """calibration file, used instead of the capture's own; of a board in the capture it is made anew"""
     dark: Path | None = None
@@ -126,7 +127,12 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> None:
         watch.say(line)
     name = manifest.name_of(settings.capture)
     if rig != settings.rig or any(name.partition(".")[0] in Rig.model_fields for name in found.estimates):
-        rig = rig_file.next_version(rig, name, settings.day or manifest.newest_day or _day(settings.capture / MANIFEST))
+        days = manifest.days_of(_parts(settings, manifest))
+        day = settings.day or max(days.values(), default=None) or _day(settings.capture / MANIFEST)
+        if any(other != day for other in days.values()):
+            recorded = ", ".join(f"{part} {one}" for part, one in days.items())
+            watch.say(f"day         {day} for all of the rig; recorded: {recorded}")
+        rig = rig_file.next_version(rig, name, day)
     heading = "\n".join(
         (
             f"A rig as last identified from {name}: numbers with an uncertainty (1 sigma) were measured, there or before,",
@@ -149,6 +155,12 @@ def _check_version(rig: Rig, place: Path) -> None:
     if rig.version and place.is_file() and yaml_text.read(place).get("version") == rig.version:
         found = f"found version {rig.version}, as of rig, which would be lost"
         raise InputError(f"{place}: expected none, or another version of the rig, {found}; give another folder")
+
+
+def _parts(settings: Settings, manifest: Manifest) -> list[PartName]:
+    """Parts of the capture that the rig is identified from: films are of its conditions."""
+    sweeps = [name for kind in scanner_step.KINDS if (name := getattr(settings, kind)) in manifest.sweeps]
+    return [part for part in manifest.contents if part in ("board", "surface", *map(sweep_part, sweeps))]
 
 
 def _day(path: Path) -> date:

@@ -76,7 +76,7 @@ def test_each_part_has_the_day_of_its_newest_images(tmp_path, rng, monkeypatch):
             monkeypatch.setattr(recording, "_today", lambda day=day: day)
             record()
     read = read_manifest(out)
-    assert (str(read.surface.day), str(read.board.day), str(read.newest_day)) == ("2026-03-01", "2026-03-02", "2026-03-02")
+    assert read.days_of(["surface", "board"]) == {"surface": date(2026, 3, 1), "board": date(2026, 3, 2)}
 
 
 def test_what_would_be_lost_or_mixed_is_refused(tmp_path, rng):

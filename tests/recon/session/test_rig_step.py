@@ -170,3 +170,30 @@ def test_the_day_is_that_on_which_the_newest_part_was_recorded(surface, made, tm
     older = held.surface.model_copy(update={"day": date(2026, 3, 2)})
     write_manifest(copied, held.model_copy(update={"surface": older}))
     assert str(read_rig(identify(copied, tmp_path / "ours") / "rig.yaml").identified.day) == "2026-03-02"
+
+
+def test_parts_that_identification_does_not_use_do_not_date_a_rig(surface, session, made, tmp_path, capsys, monkeypatch):
+    """A surface of one day, B-scans of later ones, and a film, which changes no rig, of the last."""
+    monkeypatch.setattr(scanner_step.scanner, "identify", lambda *_: Findings())
+    monkeypatch.setattr(hand_step, "identify", lambda *_: Findings({"tracker.dropped": Estimate(0.1, 0.01, "a film")}))
+    both = shutil.copytree(surface, tmp_path / "both")
+    shutil.copytree(session / "sweep", both / "sweep")
+    sweeps = read_manifest(session)
+    days = {"tissue": date(2026, 3, 4), "air": date(2026, 3, 3), "hand": date(2026, 3, 5)}
+    parts = {name: part.model_copy(update={"day": days[name]}) for name, part in sweeps.sweeps.items()}
+    held = read_manifest(both)
+    first = held.surface.model_copy(update={"day": date(2026, 3, 2)})
+    write_manifest(both, held.model_copy(update={"surface": first, "sweeps": parts, "devices": sweeps.devices | held.devices}))
+    dated = "for all of the rig"
+    for number, (given, day) in enumerate(
+        (
+            (["hand=[hand]"], "2026-03-02"),
+            (["tissue=tissue", SCALE], "2026-03-04"),
+            ([f"tissue={both / 'sweep/tissue/us'}", "air=air", SCALE], "2026-03-03"),
+        )
+    ):
+        capsys.readouterr()
+        out = identify(both, tmp_path / f"{number}", *given)
+        assert str(read_rig(out / "rig.yaml").identified.day) == day, given
+        told = [line for line in capsys.readouterr().out.splitlines() if dated in line]
+        assert len(told) == (number > 0) and all(f"{day} {dated}; recorded: surface 2026-03-02, " in line for line in told)
