@@ -149,7 +149,6 @@ class Response:
     total_px: Estimate  # blur by the projector's lens, defocus included, at the surface's mean depth
     depth_mm: float  # that depth
     margin: float  # of the cost, by which a focus on the other side of the surface is worse; infinite without such a minimum
-    bend: Estimate  # of light = value^(gamma + bend ln value): 0 for a power law
     excess: float  # rms of residuals over the noise predicted
     pixels: Pixels
     light: Array  # (n, p) of the patterns alone, 0 to 1
@@ -471,7 +470,10 @@ class Model:
         return system, cost
 
     def equations(self, state: State, *, bend: bool = False) -> tuple[System, float, float]:
-        """The same, on request with the bend of the power law as one more shared number, the last; and the residuals' squares."""
+        """The same, and the residuals' squares.
+
+        bend : with one more shared number, the last: that of light = value^(gamma + bend ln value), 0 for a power law
+        """
         axes, table = tuple(self.pixels.along), mirrors_of(self.patterns, state.shared[GAMMA], state.frames[2], self.rounded_at)
         precision, off = self.precision, self.off_prior(state)
         size, own_size, count = len(off) + bend, 2 + len(self.pixels.along), self.pixels.images.shape[1]
@@ -582,7 +584,8 @@ def fit(
 
     Weights are those of the model's own intensities, as weights by noisy ones would pull the fit to the dark. The plane in focus
     is looked for on both sides of the surface. The covariance is that of scores summed over blocks of the image: what the model
-    can't explain errs together in a block.
+    can't explain errs together in a block. It holds for light that is nearly a power of grey levels: bent by a number that isn't
+    known either, which makes gamma twice as uncertain as a power would be.
     """
     unit = np.array([1, 2.0 ** (bits - 8), 1])
     middle = float(pixels.vergence.mean())
@@ -623,8 +626,6 @@ def fit(
     covariance = _by_blocks(system, reduced, precision)
     covariance[np.ix_(LENS, LENS)] *= LENS_ERROR**2
     covariance[BLUR, BLUR] += LEAST_BLUR_ERROR_PX**2
-    step = np.linalg.solve(reduced.normal, reduced.right)
-    bend = Estimate(float(step[-1]), float(np.sqrt(covariance[-1, -1])), "the fit") if grey else Estimate(0, np.inf, "no greys")
     light, albedo, ambient, shown = model.show(state)
     excess = float(np.sqrt(squares / free))
     return Response(
@@ -639,7 +640,6 @@ def fit(
         total_px=_total(pixels, state.shared, covariance[:5, :5]),
         depth_mm=1e3 / middle,
         margin=_margin(model, few, state, sides[1]) / excess**2,
-        bend=bend,
         excess=excess,
         pixels=pixels,
         light=light,
