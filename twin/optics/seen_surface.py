@@ -283,10 +283,8 @@ def _with_dark(light: SeenLight) -> SeenLight:
 
 def _but_for(base: Image, light: Image) -> Image:
     """Light : (h, w) that is smooth but for what it has in common with a base, without its noise; NaN where that isn't light."""
-    known = np.isfinite(light) & (base > 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        sums = gaussian_filter(np.where(known, light / base, 0), MOST_PX, mode="constant")
-        share = sums / gaussian_filter(known.astype(np.float32), MOST_PX, mode="constant")
+        share, _ = _around(np.where(base > 0, light / base, np.float32(np.nan)), MOST_PX)
     return np.where(base > 0, base * share, np.float32(np.nan))
 
 
@@ -345,9 +343,8 @@ def smoothed(points: PointMap, camera: Camera) -> tuple[Image, NDArray[np.bool_]
     noise = float(np.median(points.sigma[known & np.isfinite(points.sigma)])) / step
     # Slopes of white noise behind a Gaussian of s px: noise / (s^2 sqrt(8 pi))
     width = float(np.clip(np.sqrt(noise / (SLOPE * np.sqrt(8 * np.pi))), LEAST_PX, MOST_PX))
-    share = gaussian_filter(known.astype(float), width, mode="constant")
+    mean, share = _around(distance, width)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = gaussian_filter(np.where(known, distance, 0), width, mode="constant") / share
         moved = away * (mean / distance)[..., None] + camera.centre
     moved[~known] = np.nan
     gaps = binary_closing(known, iterations=GAP_PX) & ~known
@@ -367,11 +364,17 @@ def _backdrop(mesh: trimesh.Trimesh) -> Thing:
 
 def _filled(values: Image) -> Image:
     """Values : (h, w), some known, with means of near ones in place of unknown ones; farther off the mean at the nearest."""
-    known = np.isfinite(values)
-    share = gaussian_filter(known.astype(np.float32), MOST_PX)
-    near = gaussian_filter(np.where(known, values, 0), MOST_PX) / np.maximum(share, NEAR)
+    near, share = _around(values, MOST_PX)
     row, column = np.asarray(distance_transform_edt(share < NEAR, return_distances=False, return_indices=True))
-    return np.where(known, values, near[row, column]).astype(np.float32)
+    return np.where(np.isfinite(values), values, near[row, column]).astype(np.float32)
+
+
+def _around(values: Image, width: float) -> tuple[Image, Image]:
+    """Mean of the known values around each place : (h, w), by a Gaussian of a width in px; and the share of known ones."""
+    known = np.isfinite(values)
+    share = gaussian_filter(known.astype(values.dtype), width, mode="constant")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return gaussian_filter(np.where(known, values, 0), width, mode="constant") / share, share
 
 
 def _black_dn(rig: Rig, camera: CameraName, exposure: Exposure) -> float:
