@@ -21,7 +21,8 @@ from recon.errors import InputError
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
-SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
+JPEG = (".jpg", ".jpeg")
+SUFFIXES = (".png", ".bmp", ".tif", ".tiff", *JPEG)
 KINDS = f"an image ({', '.join(SUFFIXES)})"
 MOST_PX = 1 << 26  # of an image
 PNG_BEGIN = b"\x89PNG\r\n\x1a\n"

@@ -1,4 +1,4 @@
-"""Sizes and depths of image files, from their headers."""
+"""Sizes and depths of image files, from their headers, and signs that they aren't raw."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from recon.capture.image_formats import decode_image, size_of
+from recon.capture.image_formats import JPEG, decode_image, size_of
 from recon.capture.images import Size
 from recon.errors import InputError
 from recon.files.regular import opened, read_bytes
@@ -45,6 +45,14 @@ def bits(paths: Sequence[Path]) -> Bits:
     if brightest >= 1 << 12:
         raise InputError(f"{paths[0]}: expected 10 or 12 bits, right-aligned, found values up to {brightest}")
     return 10 if brightest < 1 << 10 else 12
+
+
+def processing(paths: Sequence[Path]) -> str:
+    """Signs, by formats alone, that a camera's images aren't its raw ones: colour, by the first and last one, JPEG, or both."""
+    ends = [decode_image(path, read_bytes(path)) for path in (paths[0], paths[-1])]
+    colour = any(image.ndim == 3 and np.ptp(image, axis=2).any() for image in ends)
+    lossy = any(path.suffix.lower() in JPEG for path in paths)
+    return " ".join(sign for sign, seen in (("colour", colour), ("JPEG", lossy)) if seen)
 
 
 def _size(path: Path) -> Size:

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError
 from recon import linear_algebra
 from recon.capture import board_part, calibration_files, surface_part
 from recon.capture.board_part import BoardCapture
+from recon.capture.image_formats import JPEG
 from recon.capture.images import image_files, read_images
 from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_manifest, sweep_part
 from recon.capture.surface_part import SurfaceCapture
@@ -44,7 +45,6 @@ GROUP = "conditions."
 CAMERAS = ("cam1", "cam2")
 BLUR_SIGMA_PX = 0.15, 0.5  # of a camera's point spread where no board showed it, and with its defocus where none showed this
 NOISE_POSES = 3  # of a board whose fringes tell the noise: tiles enough
-JPEG = (".jpg", ".jpeg")
 BLACK_SIGMA_DN = 2.0  # of a black level that no dark frames showed
 
 LENS = ("f_number", "focus_mm", "blur_px", "vignetting")

@@ -2,7 +2,8 @@
 
 Reads a folder of images, of which camera, pose and number stand in the names of folders or files, such as cam1/pose03/07.png,
 left_01.png and right_01.png, or P1_00.bmp; other names are given by `files`. Sizes and depths come from the images, the
-projector's size from the patterns. Refuses names of two meanings, and numbers of images that differ from that of the patterns.
+projector's size from the patterns. Refuses names of two meanings, and numbers of images that differ from that of the patterns;
+says which cameras' images are colour or JPEG, by which no noise can be measured.
 Writes the capture folder `out`, with a manifest that points at the images, which stay where they are; a capture that is there
 already is replaced. Takes seconds.
 
@@ -89,10 +90,15 @@ def run(config: Config) -> None:
     paths = folder_reading.image_paths(config.folder)
     reading = read(config, paths, expected)
     devices = devices_of(config, reading, patterns)
+    files = {camera: [config.folder / path for path in reading.paths(camera)] for camera in reading.cameras}
+    altered = {camera: signs for camera, paths in files.items() if (signs := image_headers.processing(paths))}
     part = {"surface": surface(reading, patterns)} if board is None else {"board": poses(reading, board, patterns)}
     write(config, part, devices)
     for line in lines(reading, patterns, devices, len(paths)):
         print(line)
+    for camera, signs in altered.items():
+        unknown = "`sonotwin identify` can't measure the camera's noise by them"
+        print(f"not raw     {camera}: images are {signs}: {unknown}; record raw grey ones, as PNG or TIFF, for that")
     print(f"wrote       {config.out}")
     print(f"next        {next_command(config)}")
 

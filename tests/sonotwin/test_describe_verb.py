@@ -109,6 +109,21 @@ def test_a_session_as_ours_is_described_as_it_is(place, capsys):
     ]
 
 
+def test_images_that_are_not_raw_are_named(place, capsys):
+    """JPEG by its name, colour by its pixels: grey in a colour file is as it was."""
+    for number in range(3):
+        draw(place / f"images/left{number}.jpg", level=90)
+        grey = np.full((16, 24, 3), 90, np.uint8)
+        assert cv2.imwrite(str(place / f"images/right{number}.png"), grey)
+    described(CHESS)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("not raw"))
+    assert line.startswith("not raw     cam1: images are JPEG: `sonotwin identify` can't measure the camera's noise by them")
+    grey[5, 7] = 80, 90, 100
+    assert cv2.imwrite(str(place / "images/right2.png"), grey)
+    described(CHESS)
+    assert "cam2: images are colour: " in capsys.readouterr().out
+
+
 def test_pairs_without_patterns(place):
     for number in range(3):
         draw(place / f"images/left{number:02d}.png")
