@@ -162,7 +162,9 @@ def _run(arguments: list[str]) -> int:
     if "-h" in overrides or "--help" in overrides:
         from sonotwin import verb_help
 
-        print(verb_help.text(verb.name, verb.module))
+        name = next((one.removeprefix("name=") for one in reversed(overrides) if one.startswith("name=")), "sweep")
+        described = verb.name == "study" and name != "sweep"  # a sweep has no file
+        print(verb_help.of_study(name) if described else verb_help.text(verb.name, verb.module))
         return 0
     for override in overrides:
         if override.startswith("-"):

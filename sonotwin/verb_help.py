@@ -6,7 +6,11 @@ beside the compiled code, by the state of all source files of this installation,
 
 import ast
 import hashlib
+import itertools
 import os
+import re
+import shlex
+import textwrap
 from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
@@ -17,6 +21,8 @@ from recon import user_cache
 from recon.errors import InputError
 
 PACKAGES = ("recon", "scenes", "twin", "trainers", "sonotwin", "conf")  # whose files a text may depend on
+WIDTH = 100  # columns of a study's purpose
+OF_ALL = "`sonotwin study --help` shows all fields of a study."
 LIBRARIES = ("pydantic", "hydra-core", "omegaconf")  # whose versions it may depend on, too
 
 
@@ -40,6 +46,26 @@ def text(verb: str, module: str) -> str:
     made = make(verb, module)
     user_cache.keep(place, f"{state}\n{made}".encode())
     return made
+
+
+def of_study(name: str) -> str:
+    """The help of `sonotwin study name=...`: title and purpose of a study of conf/study or of a file, and its fields.
+
+    Raises
+    ------
+    InputError
+        If there is no such study.
+    """
+    from sonotwin import choices, study_plan
+
+    study, path = study_plan.read_study(name), choices.file_of("study", name, "name")
+    assert study is not None  # which a sweep alone is
+    written = path.read_text(encoding="utf-8").splitlines()
+    head = list(itertools.takewhile(lambda line: line.startswith("#"), written))
+    purpose = re.sub(r"^\S+\.ya?ml: ", "", " ".join(line.removeprefix("#").strip() for line in head))
+    usage = f"usage: sonotwin study name={shlex.quote(name)} out=FOLDER [field=value ...]"
+    fields = "\n".join(f"  {line}".rstrip() for line in written[len(head) :])
+    return "\n\n".join(filter(None, [usage, study.title, textwrap.fill(purpose, WIDTH), f"{path}:", fields, OF_ALL]))
 
 
 def make(verb: str, module: str) -> str:

@@ -2,7 +2,8 @@
 
 Reads the study that `name` says from conf/study, or a YAML file of one's own; `name=sweep` needs `of`, the experiment, and
 `over`, the fields to vary. Writes OUT/{table.parquet,report.html,figures/,study.json} and OUT/trials/, from which a run goes on
-that was stopped, or has more values or seeds. A trial takes from a second (chain) to three minutes (laboratory, 34 poses).
+that was stopped, or has more values or seeds. A trial takes from a second (chain) to three minutes (laboratory, 34 poses), of
+training six. `sonotwin study name=NAME --help` says what a study of conf/study is for.
 
     sonotwin study name=phase_steps out=outputs/phase_steps engine.workers=2
     sonotwin study name=sweep of=surface over='{shooting.exposure_s: [0.002, 0.004, 0.008]}' seeds=3 out=outputs/exposure

@@ -84,6 +84,20 @@ def test_help_of_a_verb(verb, no_texts, monkeypatch, capsys):
     assert capsys.readouterr().out == text
 
 
+def test_help_of_a_study_is_its_own(tmp_path, capsys):
+    """Its title, its purpose without the file's name, and its fields with their comments; of a file without a purpose, too."""
+    assert cli.main(["study", "name=exposure", "--help"]) == 0
+    usage, title, purpose, _, fields, _ = capsys.readouterr().out.strip().split("\n\n")
+    assert usage.startswith("usage: sonotwin study name=exposure ") and title == "Exposure"
+    assert purpose == "light against noise, until images saturate"
+    assert "\n  of: surface\n  over:\n    shooting.exposure_s: {from: " in fields
+    (tmp_path / "our own.yaml").write_text("title: Ours\nof: chain\nover: {}\n", encoding="utf-8")
+    assert cli.main(["study", "name=exposure", f"name={tmp_path / 'our own.yaml'}", "-h"]) == 0
+    usage, title, _, fields, _ = capsys.readouterr().out.strip().split("\n\n")
+    assert f"name='{tmp_path / 'our own.yaml'}'" in usage and title == "Ours" and "of: chain" in fields
+    assert cli.main(["study", "name=exposur", "--help"]) == 2 and "did you mean exposure" in capsys.readouterr().err
+
+
 def test_help_has_fields_that_settings_inherit(no_texts, capsys):
     assert cli.main(["export", "--help"]) == 0
     assert "  screen_px: " in capsys.readouterr().out
