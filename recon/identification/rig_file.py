@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from recon.errors import InputError, one_line
 from recon.files import atomic
-from recon.identification.estimates import Findings
+from recon.identification.estimates import Estimate, Findings
 from recon.model.rig import Identified, Measured, Rig
 
 DIGITS = 2  # of a standard deviation, to which a value is written
@@ -79,6 +79,14 @@ def write_fields(
     lines = [*(f"# {line}" for line in heading.splitlines()), *_lines(content, "", measured, unknown)]
     with atomic.new_file(path) as new:
         new.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def in_words(one: Estimate) -> str:
+    """A number and its standard deviation, as far as it is known, such as 1736.471 ± 0.073."""
+    if not 1e-6 < one.sigma < math.inf:
+        return f"{one.value:.5g} ± {one.sigma:.2g}"
+    decimals = max(DIGITS - 1 - math.floor(math.log10(one.sigma)), 0)
+    return f"{one.value:.{decimals}f} ± {one.sigma:.{decimals}f}"
 
 
 def _lines(content: Mapping[str, Any], above: str, measured: Mapping[str, Measured], unknown: Mapping[str, str]) -> Iterator[str]:

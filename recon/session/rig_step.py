@@ -1,6 +1,7 @@
 """The rig's parameters from its own captures: the settings of the step, the step, and the files of its result."""
 
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -480,16 +481,26 @@ def _write_conditions(path: Path, conditions: Part, found: Findings, name: str) 
 
 
 def describe(found: Findings) -> Iterator[str]:
-    """Lines: numbers by the part of the rig that they are of, and what isn't known for one reason."""
-    parts: dict[str, list[str]] = {}
+    """Lines: a table a part of the rig, a field a line, with its source; and what isn't known for one reason.
+
+    A source that all of a part have stands above them.
+    """
+    parts: dict[str, dict[str, list[Estimate]]] = {}
     for name, one in found.estimates.items():
         device, optics, field = name.partition(".optics.")
         part, _, field = (f"{device}.optics", "", field) if optics else name.rpartition(".")
         if name.startswith(scanner_step.GROUP):
             part, _, field = name.partition(".")
-        parts.setdefault(part, []).append(f"{field} {one.value:.5g} ± {one.sigma:.2g}")
-    for part, numbers in parts.items():
-        yield f"measured    {part}: {', '.join(numbers)}"
+        parts.setdefault(part, {}).setdefault(re.sub(r"\.\d+$", "", field), []).append(one)
+    for part, fields in parts.items():
+        sources = {one.source for some in fields.values() for one in some}
+        shared = len(sources) == 1 and len(fields) > 1
+        yield f"measured    {part}{f': {sources.pop()}' if shared else ''}"
+        numbers = {field: ", ".join(map(rig_file.in_words, some)) for field, some in fields.items()}
+        names, width = max(map(len, numbers)), max(map(len, numbers.values()))
+        for field, some in fields.items():
+            line = f"  {field:{names}}  {numbers[field]:{width}}" + ("" if shared else f"  {some[0].source}")
+            yield line.rstrip()
     reasons: dict[str, list[str]] = {}
     for name, why in found.unknown.items():
         reasons.setdefault(why, []).append(name)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from recon.capture.manifest import read_manifest
-from recon.identification.estimates import Findings
+from recon.identification import rig_file
+from recon.identification.estimates import Estimate, Findings
 from recon.session import rig_step
 from sonotwin.choices import read, read_rig
 from sonotwin.cli import main
@@ -78,7 +79,8 @@ def test_a_surface_gives_a_file_for_other_verbs(identified):
         known = rig.measured[name]
         assert abs(rig.number(name) - true) < 4 * known.sigma and known.sigma < 0.1 * true, name
         assert found["estimates"][name]["source"] == known.source
-    assert "measured    cam1.sensor: " in said and "unknown     cam1.sensor.quantum_efficiency: " in said
+    assert f"\nmeasured    projector\n  gamma  {rig_file.in_words(Estimate(**found['estimates']['projector.gamma']))}  " in said
+    assert "\n  black_level_dn  " in said and "unknown     cam1.sensor.quantum_efficiency: " in said
     text = (out / "rig.yaml").read_text()
     assert text.startswith("# A rig as last identified from capture") and "# not measured: " in text
     conditions = (out / "conditions.yaml").read_text()
@@ -187,7 +189,7 @@ def test_a_rendered_phantom_gives_a_scanner_for_other_verbs(tmp_path, capsys):
     ours = tmp_path / "ours"
     assert main(["identify", f"capture={out / 'capture'}", *named, *sheet, f"out={ours}"]) == 0
     said = capsys.readouterr().out
-    assert "measured    ultrasound: dynamic_range_db" in said and "wrote " in said and "ultrasound.yaml" in said
+    assert "measured    ultrasound\n  dynamic_range_db  " in said and "wrote " in said and "ultrasound.yaml" in said
     truth, found = Transducer(), json.loads((ours / "identified.json").read_text())["estimates"]
     read_back = Transducer.model_validate(read("ultrasound", ours / "ultrasound.yaml"))
     for name in ("dynamic_range_db", "receive_f_number", "transmit_focus_mm", "gain_db", "tgc_db_per_cm_mhz", "elevation_mm"):

@@ -131,6 +131,32 @@ def test_unlike_captures_one_after_another_lose_nothing(surface, session, made, 
     assert conditions_of(again) == conditions_of(third)
 
 
+def test_a_field_is_a_line_of_a_table_with_its_source():
+    """As far as each number is known; a vector in one line, and one source of a whole part above it."""
+    found = Findings(
+        {
+            "cam1.optics.focal_px.0": Estimate(1736.4712, 0.0732, "a board"),
+            "cam1.optics.focal_px.1": Estimate(1742.2294, 0.11, "a board"),
+            "cam1.optics.distortion.0": Estimate(-0.138967, 0.00056, "a board"),
+            "cam1.sensor.saturation_e": Estimate(27504.3, 480.0, "flat frames"),
+            "cam1.sensor.prnu": Estimate(0.0032401, 1e-5, "bright flat frames"),
+            "dark_columns.12": Estimate(0.0, 0.0, "tissue"),
+        },
+        {"cam1.sensor.adc_bits": "see the data sheet"},
+    )
+    assert list(rig_step.describe(found)) == [
+        "measured    cam1.optics: a board",
+        "  focal_px    1736.471 ± 0.073, 1742.23 ± 0.11",
+        "  distortion  -0.13897 ± 0.00056",
+        "measured    cam1.sensor",
+        "  saturation_e  27504 ± 480          flat frames",
+        "  prnu          0.003240 ± 0.000010  bright flat frames",
+        "measured    dark_columns",
+        "  12  0 ± 0  tissue",
+        "unknown     cam1.sensor.adc_bits: see the data sheet",
+    ]
+
+
 def test_conditions_begin_from_those_given(surface, made, tmp_path, capsys):
     """An earlier film's tremor stays, flicker is measured again; without them it is said that they are lost."""
     earlier = tmp_path / "earlier.yaml"
