@@ -35,6 +35,8 @@ from recon.geometry.ellipses import Ellipses
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.pose_fits import fit_in_poses
 from recon.model.boards import Discs
+from recon.model.calibration import Calibration
+from recon.model.rig import DEVICES, Rig
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,7 @@ CHANCE = 2.0  # times its own error's variance, from which on a variation over t
 FREE = 3  # of these, that the poses' means determine
 LEAST_APERTURE = 0.05  # mm, to begin with: a pinhole has no slopes
 STEP, TINY = 1e-5, 1e-9  # of differences, px and px^2; of what is held to zero
+OFF_FOCUS = 1.25  # ratio to the nearest or farthest place of a board, from which on a focus is another rig's
 NEAREST, FARTHEST, STARTS = 0.4, 3.0, 25  # of the depths seen: where the focus is looked for, and how many places
 
 
@@ -348,3 +351,32 @@ def _in_words(fit: _Fit) -> str:
     disc = np.median(fit.rims.scale) * (fit.values[RATIO] - fit.values[APERTURE] / depths)
     spreads = ", ".join(f"{spread:.2f}" for spread in np.sqrt(np.maximum(fit.values[BLUR2] + disc**2 / 16, 0)))
     return f"the image of a point is spread by {spreads} px at {', '.join(f'{depth:.0f}' for depth in depths)} mm"
+
+
+def focused_on(rig: Rig, calibration: Calibration, boards: Sequence[Array], known: Findings) -> tuple[Rig, list[str]]:
+    """The rig, with lenses focused on the middle of a board's places where their own focus is far from all of these; in words.
+
+    The focus of another rig, with which a description begins, would blur whatever is predicted there. A measured one stays; so
+    does one within a quarter of the nearest or the farthest place.
+
+    Parameters
+    ----------
+    boards : each (n, 3) mm
+        Points of the board in its poses, in the world.
+    known : Findings
+        What is measured now.
+    """
+    changed, said, points = {}, list[str](), np.concatenate(boards)
+    for name in (name for name in DEVICES if name in calibration.cameras):
+        field, device = f"{name}.lens.focus_mm", getattr(rig, name)
+        depths = rigid.apply(calibration.cameras[name].camera_from_world, points)[:, 2]
+        near, middle, far = float(depths.min()), float(np.median(depths)), float(depths.max())
+        focus = device.lens.focus_mm
+        if field in known.estimates or field in rig.measured or near / OFF_FOCUS <= focus <= far * OFF_FOCUS:
+            continue
+        changed[name] = device.model_copy(update={"lens": device.lens.model_copy(update={"focus_mm": middle})})
+        said.append(
+            f"{field}: {focus:.0f} mm, as the rig begins with, isn't where the board stood, {near:.0f} to {far:.0f} mm away: "
+            f"{middle:.0f} mm is assumed"
+        )
+    return rig.model_copy(update=changed), said

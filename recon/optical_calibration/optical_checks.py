@@ -186,7 +186,8 @@ def _contradictions(observations: Observations, adjustment: Adjustment) -> list[
 def measuring_part(adjustment: Adjustment, device: str) -> Array:
     """Corners : (m, 2) px of the part of a device's image that measures.
 
-    Of a camera all of it; of a projector what camera 1 sees of it, from where the board was nearest to where it was farthest.
+    Of a camera all of it; of a projector what camera 1 sees of it, from where the board was nearest to where it was farthest, or
+    all of it where one of the lens models folds before camera 1's corners.
     """
     cameras = adjustment.calibration.cameras
     corners = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
@@ -198,7 +199,8 @@ def measuring_part(adjustment: Adjustment, device: str) -> Array:
     if not np.isfinite(rays).all():
         return corners * cameras[device].size
     world = np.concatenate([rays / rays[:, 2:] * depth for depth in (depths.min(), depths.max())])
-    return np.clip(cameras[device].project(world), 0, cameras[device].size)
+    reached = cameras[device].project(world)
+    return np.clip(reached, 0, cameras[device].size) if np.isfinite(reached).all() else corners * cameras[device].size
 
 
 def coverage(pixels: Array, part: Array) -> float:

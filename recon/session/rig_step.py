@@ -23,6 +23,7 @@ from recon.capture.manifest import MANIFEST, Device, Manifest, PartName, read_ma
 from recon.capture.surface_part import SurfaceCapture
 from recon.errors import InputError, one_line
 from recon.files import atomic, yaml_text
+from recon.geometry import rigid
 from recon.identification import calibrated_optics, lenses, projector, raw_images, rig_file, sensors, vignetting
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.photon_transfer import has_free_dimensions
@@ -220,6 +221,11 @@ def _optical(settings: Settings, manifest: Manifest, rig: Rig, found: Findings, 
     if board is not None:
         with watch.busy("measuring the lenses"):
             found |= _lenses(*board, settings, rig, found)
+        adjusted = board[1].adjustment
+        boards = [rigid.apply(pose, adjusted.points) for pose in adjusted.poses]
+        rig, moved = lenses.focused_on(rig, calibration, boards, found)
+        for line in moved:
+            watch.say(f"focus       {line}")
     if CAMERAS[0] in shots:
         with watch.busy("measuring the projector"):
             found |= _projector(CAMERAS[0], shots[CAMERAS[0]], rig, found, frames[CAMERAS[0]].room)

@@ -9,7 +9,8 @@ lengths, of which `identify` measures none, and often others. The projector's li
 first. Takes some seconds.
 
 The noise of camera 1, the projector's raster and the errors of a calibration whose covariance the rig has are in it; flicker, and
-light that spreads in skin, aren't. Fringes along columns, rows or both count as in the reconstruction. With `sessions` whole ones
+light that spreads in skin, aren't. Fringes along columns, rows or both count as in the reconstruction, and Gray code alone by its
+cells. With `sessions` whole ones
 are drawn, from the board to a mass, with the errors of `conditions`: what detectors would find is drawn, and the real software
 does the rest. They say the errors of points, pixels of B-scans and masses' centres.
 

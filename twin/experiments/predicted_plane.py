@@ -2,8 +2,8 @@
 
 At places all over the view: the light that comes back, the noise and the modulation of the finest fringes in it, the phase's
 error, and the plane's by the slope of the projector's column along the camera's ray, or row, or both as they are weighed by the
-triangulation; and what a calibration with covariance lets the plane bend. What is left of frames' errors after the decoder took
-them off is not in it.
+triangulation; and what a calibration with covariance lets the plane bend. Of Gray code alone it is the error of its cells. Errors
+of frames that the decoder leaves are not in it.
 
 Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise.
 """
@@ -20,11 +20,12 @@ from recon.geometry.camera import Array
 from recon.geometry.primitives import Plane
 from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
-from recon.model.patterns import Axis, Fringes, Patterns
+from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
 from recon.model.rig import CameraDevice, ProjectorDevice, Rig
 from recon.optical_calibration import uncertainty as calibrated
 from scenes.kinds import plane
-from twin.experiments import closed_forms
+from twin.experiments import closed_forms, predicted_cells
+from twin.experiments.predicted_cells import Light
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.sensor import Exposure, electrons_per_radiance, noise_dn, number_per_electron
@@ -52,8 +53,8 @@ class Prediction(NamedTuple):
     """Errors of a plane's points, RMS over what camera and projector both see."""
 
     rms_mm: float
-    noise_mm: float  # by the cameras' noise alone
-    mirrors_mm: float  # by the projector's raster alone
+    noise_mm: float  # by the cameras' noise alone; 0 of Gray code alone, whose cells it may widen
+    mirrors_mm: float  # by the projector's raster alone, or by the cells of Gray code alone
     optics_mm: float  # by errors of the calibration alone, as they are expected; 0 if the rig has no covariance
     optics_sigma_mm2: float  # standard deviation of the square of that, from one calibration to the next
     modulation_dn: float  # median, of the axis that counts most
@@ -67,22 +68,25 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     Raises
     ------
     ValueError
-        If camera 1 and the projector see nothing of it together, or the patterns have no fringes.
+        If camera 1 and the projector see nothing of it together, or one axis has fringes and the other a code alone.
     """
-    axes: list[Axis] = [axis for axis in measurement.patterns.axes if measurement.patterns.has_fringes(axis)]
-    if axes != list(measurement.patterns.axes):
-        raise ValueError("patterns: expected fringes, found Gray code alone, which errs by its cells")
-    sets = [closed_forms.fringes_of(measurement.patterns, axis) for axis in axes]
+    patterns, shooting, sensor = measurement.patterns, measurement.shooting, rig.cam1.sensor
+    fringed = {axis: patterns.has_fringes(axis) for axis in patterns.axes}
+    if len(set(fringed.values())) > 1:
+        axis, alone = (next(axis for axis in fringed if fringed[axis] is kind) for kind in (True, False))
+        raise ValueError(
+            f"patterns: expected fringes along both axes or Gray code alone, found fringes of {axis}, code of {alone}"
+        )
     (flat,) = (shape for shape in plane.build(measurement.plate).shapes if isinstance(shape, Plane))
     points, slopes = _seen(rig, flat, measurement.plate)
     radiance = _radiance(rig, points, flat.normal, measurement.plate.reflectance)
     room = measurement.plate.reflectance * measurement.tracing.room_radiance * _passed(rig.cam1, points)
+    sets = [closed_forms.fringes_of(patterns, axis) for axis in fringed if fringed[axis]]
     waves = [_wave(rig, fringes, points) for fringes in sets]
-    peak = np.max([wave.peak for wave in waves], axis=0)
-    if any(not isinstance(part, Fringes) for part in measurement.patterns.parts):
+    peak = np.max([np.zeros(len(points)), *(wave.peak for wave in waves)], axis=0)
+    if any(not isinstance(part, Fringes) for part in patterns.parts):
         peak = np.ones_like(peak)  # a code's stripes, or a uniform image
     electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
-    shooting, sensor = measurement.shooting, rig.cam1.sensor
     brightest = float(np.percentile(radiance * peak + room, BRIGHTEST)) * electron  # a second
     longest_s = sensor.saturation_e / (brightest * shooting.gain)
     time_s = shooting.exposure_s or shooting.level * longest_s
@@ -90,13 +94,47 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
         expected = f"expected {1e3 * longest_s:.3g} ms at most, by which bright places saturate"
         raise ValueError(f"shooting.exposure_s: {expected}, found {1e3 * time_s:.3g} ms")
     exposure = Exposure(time_s, shooting.gain, shooting.bits)
-    per_electron = number_per_electron(sensor, exposure)
+    light = Light(radiance * electron * time_s, room * electron * time_s + sensor.dark_current_e_per_s * time_s)
+    mm_a_px = slopes.T[[AXES.index(axis) for axis in fringed]]
+    found = (
+        _by_fringes(rig, sets, waves, points, mm_a_px, light, exposure)
+        if sets
+        else _by_cells(rig, patterns, points, mm_a_px, light, exposure)
+    )
+    bent2, bent2_sigma = _bent(rig, points, flat.normal, found.sigma_px)
+    view = len(points) / (GRID[0] * GRID[1])
+    return Prediction(
+        float(np.sqrt(found.noise_mm**2 + found.mirrors_mm**2 + bent2)),
+        found.noise_mm,
+        found.mirrors_mm,
+        float(np.sqrt(bent2)),
+        bent2_sigma,
+        found.modulation_dn,
+        time_s,
+        view,
+    )
+
+
+class _Found(NamedTuple):
+    """Errors of a plane's points by what is projected, RMS over its places."""
+
+    noise_mm: float
+    mirrors_mm: float
+    modulation_dn: float  # median, of the axis that counts most
+    sigma_px: dict[Axis, float]  # of the projector's coordinates
+
+
+def _by_fringes(
+    rig: Rig, sets: Sequence[Fringes], waves: "Sequence[_Wave]", points: Array, mm_a_px: Array, light: Light, exposure: Exposure
+) -> _Found:
+    """By the phases of fringes of each axis, as they are weighed; mm_a_px : (axes, n)."""
+    per_electron = number_per_electron(rig.cam1.sensor, exposure)
     by_noise, by_mirrors, modulations, sigma_px = [], [], [], dict[Axis, float]()
-    for fringes, wave, mm_a_px in zip(sets, waves, slopes.T[[AXES.index(axis) for axis in axes]], strict=True):
+    for fringes, wave, slope in zip(sets, waves, mm_a_px, strict=True):
         weighed = wave.mean - wave.second / 2  # light at the steps by which the phase is known, where it is steep: sin^2
-        counted_e = (radiance * weighed + room) * electron * time_s + sensor.dark_current_e_per_s * time_s
-        modulations.append(radiance * wave.amplitude * electron * time_s * per_electron)
-        noise, mm_a_rad = noise_dn(np.float32(counted_e), sensor, exposure), fringes.pitch / (2 * np.pi) * mm_a_px
+        counted_e = light.projector * weighed + light.room
+        modulations.append(light.projector * wave.amplitude * per_electron)
+        noise, mm_a_rad = noise_dn(np.float32(counted_e), rig.cam1.sensor, exposure), fringes.pitch / (2 * np.pi) * slope
         phase = np.sqrt(2 / fringes.steps) * noise / modulations[-1]
         sigma_px[fringes.axis] = float(np.median(phase)) * fringes.pitch / (2 * np.pi)
         by_noise.append(mm_a_rad * phase)
@@ -104,18 +142,26 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     weights = np.array(by_noise) ** -2.0
     weights /= weights.sum(axis=0)
     noise_mm, mirrors_mm = (float(np.sqrt(np.mean(np.nansum((weights * one) ** 2, axis=0)))) for one in (by_noise, by_mirrors))
-    bent2, bent2_sigma = _bent(rig, points, flat.normal, sigma_px)
-    view = len(points) / (GRID[0] * GRID[1])
-    return Prediction(
-        float(np.sqrt(noise_mm**2 + mirrors_mm**2 + bent2)),
-        noise_mm,
-        mirrors_mm,
-        float(np.sqrt(bent2)),
-        bent2_sigma,
-        float(np.median(modulations[int(np.argmax(weights.mean(axis=1)))])),
-        time_s,
-        view,
-    )
+    modulation = float(np.median(modulations[int(np.argmax(weights.mean(axis=1)))]))
+    return _Found(noise_mm, mirrors_mm, modulation, sigma_px)
+
+
+def _by_cells(rig: Rig, patterns: Patterns, points: Array, mm_a_px: Array, light: Light, exposure: Exposure) -> _Found:
+    """By the cells of a code of each axis, as they are weighed; mm_a_px : (axes, n). ValueError where no bit is read."""
+    places = rig.projector.optics.camera().project(points)
+    codes = [next(part for part in patterns.parts if isinstance(part, GrayCode) and part.axis == axis) for axis in patterns.axes]
+    sigma_px, (off, weight) = dict[Axis, float](), np.zeros((2, len(points), 1))
+    for code, slope in zip(codes, mm_a_px[..., None], strict=True):
+        read = predicted_cells.read(rig, code, places[:, AXES.index(code.axis)], points, light, exposure)
+        known = np.isfinite(read.error)
+        if not known.any():
+            raise ValueError(f"patterns: expected a code of {code.axis} that can be read, found it too dark or too blurred")
+        inverse = np.where(known, read.sigma, np.inf) ** -2.0 / slope
+        off, weight = off + inverse * np.where(known, read.error, 0), weight + inverse / slope
+        sigma_px[code.axis] = float(np.median(read.sigma[known]))
+    cells_mm = float(np.sqrt(np.mean((off[weight > 0] / weight[weight > 0]) ** 2)))
+    modulation = float(np.median(light.projector)) * (1 - 1 / rig.projector.contrast) / 2
+    return _Found(0.0, cells_mm, modulation * number_per_electron(rig.cam1.sensor, exposure), sigma_px)
 
 
 def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:

@@ -6,8 +6,10 @@ from scipy import stats
 
 from recon.board_detection.discs import measure
 from recon.geometry.ellipses import Ellipses
-from recon.identification.estimates import Estimate
-from recon.identification.lenses import Rims, find_lens, fitted_width, joined, measure_rims, widths
+from recon.identification.estimates import Estimate, Findings
+from recon.identification.lenses import Rims, find_lens, fitted_width, focused_on, joined, measure_rims, widths
+from recon.model.calibration import Calibration
+from recon.model.rig import Measured
 from tests.recon.identification import lit_boards
 from tests.recon.identification.exact_discs import SIDE, share
 
@@ -147,3 +149,16 @@ def test_the_twin_s_lens_is_found(rig, rng):
     found = find_lens(rims, focal_length=Estimate(lens.focal_length_mm, 0.0, "engraved"), print_mm=0)
     z = scored(found, (lens.f_number, lens.focus_mm, lens.blur_px))
     assert "blur_px" in z and max(map(abs, z.values())) < 3.5
+
+
+@pytest.mark.parametrize(
+    ("away_mm", "measured", "moves"), [(3600, False, True), (3600, True, False), (700, False, False), (350, False, True)]
+)
+def test_a_focus_of_another_rig_is_taken_from_where_the_board_stood(rig, away_mm, measured, moves):
+    """From boards at 3500 to 3700 mm, say, before a rig that is focused at 660 mm; not what was measured, nor what is near."""
+    name = "cam1.lens.focus_mm"
+    known = rig.model_copy(update={"measured": {name: Measured(sigma=1.0, source="a test")} if measured else {}})
+    boards = [np.array([[0.0, 0.0, away_mm + side]]) for side in (-100, 0, 100)]
+    found, said = focused_on(known, Calibration({"cam1": rig.cam1.optics.camera()}), boards, Findings())
+    assert found.cam1.lens.focus_mm == (away_mm if moves else rig.cam1.lens.focus_mm) and len(said) == moves
+    assert found.projector == rig.projector and all(f"{away_mm - 100} to {away_mm + 100} mm" in line for line in said)
