@@ -1,4 +1,4 @@
-"""Settings of the documentation site: Sphinx reads README.md, CHANGELOG.md, CONTRIBUTING.md and docs/; `make docs` builds it.
+"""Settings of the documentation site: Sphinx reads the pages of the root folder and docs/; `make docs` builds it.
 
 The source folder is the repository's root, so that links between these pages are the same on the site and on a forge.
 """
@@ -20,7 +20,7 @@ project = "sonotwin"
 author = "The sonotwin authors"
 version = release = metadata.version("sonotwin")
 root_doc = "docs/index"
-include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/**"]
+include_patterns = ["README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs/**"]
 exclude_patterns = [".*", "build", "dist", "outputs", "tests", "docs/site"]
 
 extensions = ["myst_parser", "sphinx.ext.apidoc", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]

@@ -197,10 +197,9 @@ def _complain(message: str, status: int = 2) -> int:
 
 def _how_to_install(module: str) -> str | None:
     """Say how to get a missing package, or None if it is none of sonotwin's requirements."""
-    from sonotwin.installation import extra_of
+    from sonotwin.installation import extra_of, how_to_install
 
     extra = extra_of(module)
     if extra is None:
         return None
-    wanted = "." if extra == "core" else f".[{extra}]"
-    return f"the Python package {module.partition('.')[0]} is missing; run pip install '{wanted}' in sonotwin's folder"
+    return f"the Python package {module.partition('.')[0]} is missing; run {how_to_install(extra)}"

@@ -16,6 +16,7 @@ from sonotwin import namesakes
 from twin import llvm
 
 OLDEST_PYTHON = (3, 11)
+REINSTALL = "pip install --force-reinstall --no-deps with the wheel, or with '.' in a clone"
 EXTRAS = ("twin", "study", "live", "train", "dev", "docs")
 MODULES = {  # where a package isn't imported by the name that it is installed by
     "hydra-core": "hydra",
@@ -62,6 +63,14 @@ def extra_of(module: str) -> str | None:
     return next((part for part, name, _ in requirements() if MODULES.get(name, name) == top), None)
 
 
+def how_to_install(part: str) -> str:
+    """The command that brings what a part of an installation lacks, of a wheel and of a clone alike.
+
+    pip takes the parts of what is installed from its metadata: it needs neither the wheel nor an index that has sonotwin.
+    """
+    return f"pip install '{'sonotwin' if part == 'core' else f'sonotwin[{part}]'}'"
+
+
 def requirements() -> Iterator[tuple[str, str, str]]:
     """Yield sonotwin's own requirements: part ("core" or the extra), package, version range."""
     from packaging.requirements import Requirement
@@ -103,11 +112,11 @@ def _own_packages() -> Iterator[Finding]:
     for place in namesakes.places():
         strangers = sorted(set(brought.get(place.name, ())) - {"sonotwin"})
         if place.found is None:
-            yield Finding("core", place.name, "problem", "not found", "pip install '.' in sonotwin's folder")
+            yield Finding("core", place.name, "problem", "not found", REINSTALL)
         elif place.hidden:
             yield Finding("core", place.name, "problem", f"{place.found} hides ours, {place.ours}", place.remedy)
         elif strangers and place.found.parent.name == "site-packages":
-            remedy = f"pip uninstall {' '.join(strangers)}, then pip install --force-reinstall '.' in sonotwin's folder"
+            remedy = f"pip uninstall {' '.join(strangers)}, then {REINSTALL}"
             found = f"{place.found} has files of {', '.join(strangers)}, too"
             yield Finding("core", place.name, "problem", found, remedy)
         else:
@@ -127,7 +136,7 @@ def _packages() -> Iterator[Finding]:
     absent: dict[str, list[str]] = {}
     faults = []
     for part, name, accepted in wanted:
-        remedy = f"pip install '{_distribution(part)}' in sonotwin's folder"
+        remedy = how_to_install(part)
         found = installed[name]
         failure = broken.get(MODULES.get(name, name))
         if found is None and part != "core":
@@ -143,13 +152,8 @@ def _packages() -> Iterator[Finding]:
             sound.setdefault(part, []).append(f"{name} {found}")
     yield from (Finding(part, "packages", "ok", ", ".join(names)) for part, names in sound.items())
     for part, names in absent.items():
-        yield Finding(part, "packages", "absent", f"{', '.join(names)}; pip install '{_distribution(part)}' in sonotwin's folder")
+        yield Finding(part, "packages", "absent", f"{', '.join(names)}; {how_to_install(part)}")
     yield from faults
-
-
-def _distribution(part: str) -> str:
-    """The argument of pip for a part."""
-    return "." if part == "core" else f".[{part}]"
 
 
 def _version(name: str) -> str | None:

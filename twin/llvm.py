@@ -263,7 +263,7 @@ def _remember(path: Path, verdict: Verdict) -> None:
     target = cache_file()
     with suppress(OSError):  # without a writable cache the library is tried again next time, which costs a second
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=target.parent, delete=False) as stream:
+        with tempfile.NamedTemporaryFile("w", encoding="utf-8", dir=target.parent, delete=False) as stream:
             json.dump(content, stream, indent=1)
         os.replace(stream.name, target)
 

@@ -26,14 +26,14 @@ def test_a_file_comes_first(tmp_path, monkeypatch):
 def test_a_file_may_start_from_a_shipped_one(suffix, tmp_path, monkeypatch):
     """For the command, for Python and for a study's values alike."""
     monkeypatch.chdir(tmp_path)
-    Path(f"ours{suffix}").write_text("defaults: [lifelike]\nsound: {tissue: 0.01}\n")
-    Path(f"rig{suffix}").write_text("defaults: [meza2021]\nprojector: {gamma: 1.5}\n")
+    Path(f"ours{suffix}").write_text("defaults: [lifelike]\nsound: {tissue: 0.01}\n", encoding="utf-8")
+    Path(f"rig{suffix}").write_text("defaults: [meza2021]\nprojector: {gamma: 1.5}\n", encoding="utf-8")
     usual, ours = sonotwin.read_rig(), sonotwin.read_rig(f"rig{suffix}")
     assert ours.projector.gamma == 1.5 and ours.cam1 == usual.cam1
     lifelike = study_plan.choice("conditions", "lifelike")
     assert study_plan.choice("conditions", f"ours{suffix}") == lifelike | {"sound": lifelike["sound"] | {"tissue": 0.01}}
     assert study_plan.choice("conditions", f"ours{suffix}.motion") == {"motion": lifelike["motion"]}
-    Path(f"ours{suffix}").write_text("defaults: [lifelyke]\n")
+    Path(f"ours{suffix}").write_text("defaults: [lifelyke]\n", encoding="utf-8")
     with pytest.raises(
         InputError, match=rf"^ours{suffix}: defaults: expected one of ideal, lifelike, found lifelyke; did you mean"
     ):

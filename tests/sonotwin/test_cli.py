@@ -198,13 +198,13 @@ def test_a_mistake_in_a_process_of_its_own():
         (InputError("a.png: expected 8-bit grey,\nfound RGB"), "a.png: expected 8-bit grey, found RGB"),
         (
             ModuleNotFoundError("...", name="mitsuba.python"),
-            "the Python package mitsuba is missing; run pip install '.[twin]' in sonotwin's folder",
+            "the Python package mitsuba is missing; run pip install 'sonotwin[twin]'",
         ),
         (
             ModuleNotFoundError("...", name="drjit"),
-            "the Python package drjit is missing; run pip install '.[twin]' in sonotwin's folder",
+            "the Python package drjit is missing; run pip install 'sonotwin[twin]'",
         ),
-        (ModuleNotFoundError("...", name="cv2"), "the Python package cv2 is missing; run pip install '.' in sonotwin's folder"),
+        (ModuleNotFoundError("...", name="cv2"), "the Python package cv2 is missing; run pip install 'sonotwin'"),
         (PermissionError(13, "Permission denied", "out/surface.ply"), "out/surface.ply: Permission denied"),
         (OSError(28, "No space left on device"), "output: No space left on device"),
     ],

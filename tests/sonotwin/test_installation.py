@@ -60,7 +60,7 @@ def test_a_missing_core_package_is_status_2(others_work, monkeypatch, capsys):
     assert cli.main(["doctor"]) == 2
     captured = capsys.readouterr()
     assert captured.err == "sonotwin: doctor: the core can't be used, because of scipy\n"
-    assert "core scipy: pip install '.' in sonotwin's folder" in captured.out
+    assert "core scipy: pip install 'sonotwin'" in captured.out
 
 
 def test_cameras_are_listed(monkeypatch):
@@ -75,7 +75,7 @@ def test_a_missing_twin_is_status_0(others_work, monkeypatch, capsys):
     real = installation._version
     monkeypatch.setattr(installation, "_version", lambda name: None if name in ("mitsuba", "drjit") else real(name))
     assert cli.main(["doctor"]) == 0
-    assert "mitsuba; pip install '.[twin]' in sonotwin's folder" in capsys.readouterr().out
+    assert "mitsuba; pip install 'sonotwin[twin]'" in capsys.readouterr().out
 
 
 def test_a_core_alone_fits_a_screen(others_work, monkeypatch, capsys):
@@ -85,7 +85,7 @@ def test_a_core_alone_fits_a_screen(others_work, monkeypatch, capsys):
     monkeypatch.setattr(installation, "_version", lambda name: None if name in extras else real(name))
     assert cli.main(["doctor"]) == 0
     said = capsys.readouterr().out
-    assert all(name in said for name in extras) and "pip install '.[live]'" in said
+    assert all(name in said for name in extras) and "pip install 'sonotwin[live]'" in said
     assert len(said.splitlines()) <= 40 and max(map(len, said.splitlines())) <= 130
     assert [line.split()[:3] for line in said.splitlines()].count(["live", "packages", "absent"]) == 1
 

@@ -328,7 +328,7 @@ def test_the_page_tracks(rig, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (command,) = commands("track")
     assert main(command) == 0
-    assert json.loads(Path("tracked/metrics.json").read_text())["frames_found"] == 2
+    assert json.loads(Path("tracked/metrics.json").read_text(encoding="utf-8"))["frames_found"] == 2
 
 
 @pytest.mark.slow
@@ -360,11 +360,11 @@ def test_the_page_measures(rig, tmp_path, monkeypatch):
         else:
             images.write_images(named, pictures)
         assert main(arguments) == 0
-        assert json.loads(Path("surface/metrics.json").read_text())["points"] > 125_000
+        assert json.loads(Path("surface/metrics.json").read_text(encoding="utf-8"))["points"] > 125_000
 
     text, of_gray_code = blocks("yaml")
-    Path("sequence.yaml").write_text(text)
-    Path("gray_code.yaml").write_text(of_gray_code)
+    Path("sequence.yaml").write_text(text, encoding="utf-8")
+    Path("gray_code.yaml").write_text(of_gray_code, encoding="utf-8")
     sequence = surface_part.read_patterns(Path("sequence.yaml"))
     assert surface_part.read_patterns(Path("gray_code.yaml")).count == 22
     shutil.rmtree("shots")

@@ -164,4 +164,4 @@ sys.exit(main(["train", "network=detector", "data=x", "out=y", "steps=1"]))
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "the Python package torch is missing; run pip install '.[train]'" in done.stderr
+    assert "the Python package torch is missing; run pip install 'sonotwin[train]'" in done.stderr

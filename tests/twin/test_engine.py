@@ -139,7 +139,7 @@ def sleeps(folder: str, k: int) -> None:
 
 def alive(process: int) -> bool:
     stat = Path(f"/proc/{process}/stat")
-    return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
+    return stat.exists() and stat.read_text(encoding="utf-8").rpartition(")")[2].split()[0] != "Z"
 
 
 def wait_until(true, seconds: float = PATIENCE_S) -> None:

@@ -36,7 +36,7 @@ def everything(root: Path) -> dict[str, str]:
 
 def write(path: Path, text: str = "years of work") -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
 
 
 def linked(path: Path, target: Path) -> None:

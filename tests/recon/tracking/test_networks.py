@@ -1,5 +1,10 @@
 """Networks are loaded if they are the right ones, and their answers are read as published."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -150,3 +155,15 @@ def test_each_level_of_windows_shows_all_of_a_frame(size):
     frame = np.add.outer(np.arange(size[1]), 2 * np.arange(size[0])) % 251
     for window in (around, whole[0], windows[-1]):
         assert window.cut(frame.astype(np.uint8)).shape == circle_detector.FRAME[::-1]
+
+
+def test_onnx_runtime_reports_to_nobody(tmp_path):
+    """What it would send it collects in the user's cache, with a number for this computer; there is none."""
+    program = """
+from recon.tracking import networks
+networks.onnxruntime.InferenceSession(networks.WEIGHTS / "segmenter.onnx")
+"""
+    kept = {name: value for name, value in os.environ.items() if name not in ("ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")}
+    places = {"HOME": str(tmp_path), "LOCALAPPDATA": str(tmp_path), "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    subprocess.run([sys.executable, "-c", program], env=kept | places, cwd=tmp_path, check=True)
+    assert not list(tmp_path.rglob("*onnxruntime*")) and not list(tmp_path.rglob("deviceid"))
