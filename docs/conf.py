@@ -136,11 +136,13 @@ class ShortNames(PythonDomain):
 
 def setup(app: Sphinx) -> None:
     """Connect the steps above."""
-    import site_pages  # of this folder
+    import evidence_pages  # of this folder
+    import site_pages
 
     app.add_domain(ShortNames, override=True)
     app.add_directive("accuracy-rows", site_pages.AccuracyRows)
     app.add_directive("rooms", site_pages.Rooms)
+    evidence_pages.connect(app)
     app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
     app.connect("autodoc-process-signature", short_types)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
