@@ -21,6 +21,7 @@ from recon.dicom.study_objects import Study, coded, described_mass, item, refere
 from recon.errors import short
 from recon.files.volumes import Volume
 from recon.freehand.volume_compounding import Grid
+from recon.geometry import rigid
 from recon.segmentation import mass_surface
 from recon.segmentation.mass_surface import Mass
 
@@ -33,8 +34,20 @@ SOURCE = Code("121322", "DCM", "Source image for image processing operation")  #
 
 def rasterised(mesh: trimesh.Trimesh, volume: Volume) -> Mask:
     """Voxels : (nz, ny, nx) whose middles lie in a closed mesh."""
-    grid = Grid(volume.voxels.shape[::-1], volume.origin, volume.spacing, volume.directions)
-    return mass_surface.distances([Mass(mesh)], grid).voxels < 0
+    size, far = np.array(volume.voxels.shape[::-1]), mass_surface.FAR_MM / volume.spacing
+    voxel = rigid.apply(np.linalg.inv(volume.world_from_voxel), np.asarray(mesh.vertices))
+    low, high = np.floor(voxel.min(axis=0) - far).astype(int) - 1, np.ceil(voxel.max(axis=0) + far).astype(int) + 2
+    first, end = np.clip(low, 0, size), np.clip(high, 0, size)
+    mask = np.zeros(volume.voxels.shape, bool)
+    if (first < end).all():  # around all of the mesh, though the volume may end within it
+        grid = Grid(tuple((high - low).tolist()), rigid.apply(volume.world_from_voxel, low), volume.spacing, volume.directions)
+        inside = mass_surface.distances([Mass(mesh)], grid).voxels < 0
+        mask[_box(first, end)] = inside[_box(first - low, end - low)]
+    return mask
+
+
+def _box(first: NDArray[np.int64], end: NDArray[np.int64]) -> tuple[slice, ...]:
+    return tuple(slice(a, b) for a, b in zip(first[::-1], end[::-1], strict=True))
 
 
 def built(study: Study, source: Dataset, volume: Volume, masks: Mapping[str, Mask]) -> Dataset:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from recon.errors import validated
+from recon.errors import InputError, validated
 from recon.files import yaml_text
 from recon.model.part import Part
 
@@ -90,6 +90,8 @@ class Patient(Part):
 
 
 def read(path: Path) -> Patient:
-    """Read a YAML file; InputError if it is missing or damaged, or has a field that isn't known or that DICOM can't hold."""
+    """Read a YAML file; InputError if it is missing, empty or damaged, or has a field that isn't known or that DICOM can't hold."""
     content = yaml_text.read(path, "a file of a patient's fields")
-    return validated(Patient, {} if content is None else content, path)
+    if content is None:
+        raise InputError(f"{path}: expected a patient's fields, found none; leave patient out for a study that names nobody")
+    return validated(Patient, content, path)

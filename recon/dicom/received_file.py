@@ -4,20 +4,25 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from pydicom import dcmread
+from pydicom.dataelem import RawDataElement
 from pydicom.dataset import Dataset
+from pydicom.errors import InvalidDicomError
+from pydicom.filereader import read_dataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, ImplicitVRLittleEndian
 
-from recon.clips.dialects.dicom_clip import DAMAGED
+from recon.clips.dialects.dicom_clip import DAMAGED, META, PREAMBLE, PREFIX
 from recon.errors import InputError, reason, short
 from recon.files.regular import opened
 
 Array = NDArray[np.float64]
 
 MOST_BYTES = 1 << 32
+UNDEFINED = 0xFFFFFFFF  # a length that the content tells
 PLAIN = (ExplicitVRLittleEndian, ImplicitVRLittleEndian)
 FARTHEST_MM = 1e6
 SAME_MM = 0.01  # places that count as one
@@ -46,15 +51,30 @@ def read(path: Path, sop_class: UID, expected: str) -> Dataset:
         If the file is missing, no DICOM, damaged, compressed, or of another class.
     """
     with refusing(path, expected), opened(path, MOST_BYTES, expected) as stream:
+        _check_syntax(path, stream)
+        stream.seek(0)
         one = dcmread(stream)
-        syntax = one.file_meta.get("TransferSyntaxUID")
-        if syntax not in PLAIN:
-            name = "none" if syntax is None else short(UID(syntax).name)
-            raise fault(path, "TransferSyntaxUID", "uncompressed data, little endian", f"{name}: gdcmconv --raw undoes it")
+        for tag in one.keys():
+            element = one.get_item(tag)
+            if isinstance(element, RawDataElement) and element.length not in (UNDEFINED, len(element.value or b"")):
+                raise EOFError(f"{len(element.value or b'')} of {element.length} bytes at its end")  # pydicom takes what is there
         if one.get("SOPClassUID") != sop_class:
             found = one.get("SOPClassUID")
             raise fault(path, "SOPClassUID", f"{sop_class.name}", "none" if found is None else short(UID(str(found)).name))
         return one
+
+
+def _check_syntax(path: Path, stream: BinaryIO) -> None:
+    """InputError for what is compressed; before it is read, as a file that is packed as a whole may unpack to any size."""
+    stream.seek(PREAMBLE)
+    if stream.read(len(PREFIX)) != PREFIX:
+        raise InvalidDicomError(f"no {PREFIX.decode()} at byte {PREAMBLE}")
+    meta = read_dataset(stream, is_implicit_VR=False, is_little_endian=True, stop_when=lambda tag, *_: tag.group != META)
+    syntax = meta.get("TransferSyntaxUID")
+    if syntax not in PLAIN:
+        name = "none" if syntax is None else short(UID(syntax).name)
+        expected = "expected uncompressed data, little endian"
+        raise InputError(f"{path}: TransferSyntaxUID: {expected}, found {name}; gdcmconv --raw undoes compression")
 
 
 def fault(path: Path, field: str, expected: str, found: object) -> InputError:

@@ -1,5 +1,6 @@
 """The four objects of a study in a folder, written and read back together."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,9 +66,14 @@ def write(folder: Path, results: Results, patient: Patient, searched: bool) -> l
         lines.append(f"surfaces    {surfaces.NumberOfSurfaces} of {count} points in all: Surface Segmentation")
     if searched:
         figures = {name: measurement_report.measured(turned.masses[name]) for name in masks}
-        report = measurement_report.built(study, volume, segments, figures, turned.remarks)
+        apart = [
+            f"{name}, {abs(float(turned.masses[name].mesh.volume)):.0f} mm3, has no voxel of the volume." for name in outside
+        ]
+        report = measurement_report.built(study, volume, segments, figures, [*turned.remarks, *apart])
         study_objects.write(folder / REPORT, report)
-        lines.append(f"report      {len(figures)} masses, {len(turned.remarks)} remarks: Comprehensive 3D SR, unverified")
+        lines.append(
+            f"report      {len(figures)} masses, {len(turned.remarks) + len(outside)} remarks: Comprehensive 3D SR, unverified"
+        )
     named = "as the patient's file has them" if patient.identified else f"none: {volume.PatientName}, {volume.PatientID}"
     lines.append(f"patient     {named}; study {volume.StudyInstanceUID}")
     return lines
@@ -83,7 +89,7 @@ def read(folder: Path) -> Received:
     """
     over = enhanced_volume.read(folder / VOLUME)
     frame, world_from_patient = over.frame_of_reference, over.world_from_patient
-    there = {name for name in (SEGMENTS, SURFACES, REPORT) if (folder / name).exists()}
+    there = {name for name in (SEGMENTS, SURFACES, REPORT) if os.path.lexists(folder / name)}
     masks = mass_segments.read(folder / SEGMENTS, over) if SEGMENTS in there else {}
     surfaces = surface_segments.read(folder / SURFACES, frame) if SURFACES in there else {}
     figures = measurement_report.read(folder / REPORT, frame) if REPORT in there else {}
