@@ -90,7 +90,7 @@ class Patient(Part):
 
 
 def read(path: Path) -> Patient:
-    """Read a YAML file; InputError if it is missing, empty or damaged, or has a field that isn't known or that DICOM can't hold."""
+    """Read a YAML file; InputError if it is missing, empty or damaged, or has fields that aren't known or DICOM can't hold."""
     content = yaml_text.read(path, "a file of a patient's fields")
     if content is None:
         raise InputError(f"{path}: expected a patient's fields, found none; leave patient out for a study that names nobody")

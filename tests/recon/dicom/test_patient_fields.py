@@ -1,5 +1,7 @@
 """Fields of a patient's file: what DICOM holds, and directions of a right-handed frame."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,12 @@ def test_without_fields_nobody_is_named(tmp_path):
     assert not read(tmp_path, 'date: "20261130"\nregion: {code: "706342009", meaning: Phantom}').identified
     for named in ("name: Doe^Jane", "id: X1", 'birth_date: "19600101"', "study_uid: 1.2.3", 'accession_number: "7"'):
         assert read(tmp_path, named).identified
+
+
+def test_the_page_shows_all_fields(tmp_path):
+    page = (Path(__file__).parents[3] / "docs/freehand.md").read_text(encoding="utf-8")
+    text = page.split("# patient.yaml\n")[1].split("```")[0]
+    assert read(tmp_path, text).model_fields_set == set(patient_fields.Patient.model_fields)
 
 
 def test_axes_turn_the_world_into_the_patient(tmp_path):
