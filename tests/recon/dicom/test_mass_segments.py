@@ -40,8 +40,12 @@ def test_only_slices_that_show_something_are_stored(folder):
     one = dcmread(folder / "masses.dcm")
     assert one.NumberOfFrames == sum(mask.any(axis=(1, 2)).sum() for mask in masks(folder).values())
     assert one.SegmentsOverlap == "NO"
-    referenced = one.PerFrameFunctionalGroupsSequence[0].DerivationImageSequence[0].SourceImageSequence[0]
-    assert referenced.ReferencedSOPInstanceUID == dcmread(folder / "volume.dcm").SOPInstanceUID
+    volume = dcmread(folder / "volume.dcm")
+    for group in one.PerFrameFunctionalGroupsSequence:  # which slice of the volume it is, by number and by place
+        referenced = group.DerivationImageSequence[0].SourceImageSequence[0]
+        slice_of = volume.PerFrameFunctionalGroupsSequence[referenced.ReferencedFrameNumber - 1]
+        assert referenced.ReferencedSOPInstanceUID == volume.SOPInstanceUID
+        assert group.PlanePositionSequence == slice_of.PlanePositionSequence
 
 
 def test_simpleitk_sees_them_in_place(folder):
