@@ -22,7 +22,8 @@ NAMES = (
     "manifest", "calibration", "calibration_xml", "calibration_npz", "kalibr", "ros", "mrcal", "slstudio",
     "probe", "target", "tip", "lag", "stamps", "track", "authors_poses", "pairs",
     "pose_table", "image", "mesh", "model_stl", "model_glb",
-    "volume_nrrd", "volume_mha", "sequence", "plus_config", "plus_phantom", "messages", "dicom", "video",
+    "volume_nrrd", "volume_mha", "sequence", "plus_config", "plus_phantom", "messages", "dicom",
+    "archived_volume", "archived_masses", "archived_surfaces", "archived_report", "patient", "video",
     "patterns", "metrics", "truth", "check_log", "cut", "points", "shard", "centres", "outlines", "checkpoint", "network",
     "mass_network",
 )  # fmt: skip

@@ -20,9 +20,13 @@ from recon.clips import pose_tables
 from recon.clips.dialects import dicom_clip, video_clip
 from recon.clips.pose_tables import Columns
 from recon.devices.openigtlink.igtl_stream import Splitter
+from recon.dicom import enhanced_volume, mass_segments, measurement_report, patient_fields, surface_segments
+from recon.dicom.enhanced_volume import ReceivedVolume
+from recon.dicom.study_objects import Study
 from recon.errors import InputError
 from recon.files import meshes, metrics, npz, volumes
 from recon.freehand import plus_config, sequences
+from recon.geometry import rigid
 from recon.model.rig import Target
 from recon.probe_calibration import plus_phantom
 from recon.rig_check import check_log
@@ -30,6 +34,7 @@ from recon.segmentation import mass_network
 from recon.skin_projection import planned_cut
 from recon.tracking import networks
 from sonotwin import config
+from tests.recon.dicom import made_results
 from trainers import export, markerpose_layout, scan_reader, shard_reader
 from twin import session
 
@@ -63,6 +68,14 @@ def _outlines(path: Path) -> object:
 
 def _sequence(path: Path) -> object:
     return sequences.read_tracking(path), sum(1 for _ in sequences.stream_images(path))
+
+
+def _segments(path: Path) -> object:
+    """Segments over the volume that the sources have beside them."""
+    given, patient = made_results.results(), made_results.SUPINE
+    volume, turn = given.moved(patient.patient_from_world).volume, patient.patient_from_world
+    frame = Study.of(patient, given).uid("frame of reference")
+    return mass_segments.read(path, ReceivedVolume(volume, frame, rigid.invert(turn)))
 
 
 def _messages(path: Path) -> object:
@@ -106,6 +119,11 @@ READERS = {
     "plus_phantom": Reader(lambda path: plus_phantom.read(path, "Reference"), ("fcal.xml",)),
     "messages": Reader(_messages, ("small.igtl",), "file.igtl"),
     "dicom": Reader(dicom_clip.read, ("scan.dcm",), "file.dcm"),
+    "archived_volume": Reader(enhanced_volume.read, ("archived/volume.dcm",), "file.dcm"),
+    "archived_masses": Reader(_segments, ("archived/masses.dcm",), "file.dcm"),
+    "archived_surfaces": Reader(surface_segments.read, ("archived/surfaces.dcm",), "file.dcm"),
+    "archived_report": Reader(measurement_report.read, ("archived/report.dcm",), "file.dcm"),
+    "patient": Reader(patient_fields.read, ("patient.yaml",), "file.yaml"),
     "video": Reader(video_clip.read, ("screen.avi",), "file.avi"),
     "patterns": Reader(read_patterns, ("patterns.yaml",), "file.yaml"),
     "metrics": Reader(metrics.read, ("skin/metrics.json",)),

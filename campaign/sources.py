@@ -16,6 +16,7 @@ from recon.geometry import rigid
 from recon.model.tip import Tip
 from tests.recon.clips import made_clips
 from tests.recon.devices.openigtlink import igtl_peers
+from tests.recon.dicom import made_results
 from tests.recon.probe_calibration import test_plus_phantom
 from tests.recon.tip_calibration import pivot_films
 
@@ -192,6 +193,10 @@ COMMANDS = (
             ("published/SLdata/images/3.png",)),
     Command("export", ("layout=us_calibration", "capture=wires/capture"), ("wires",), _sweep("wires")),
     Command("export", ("layout=screen", "capture=scan/capture"), ("scan",), SCAN),
+    Command("export", ("layout=dicom", "volume=volume", "masses=lump", "surface=bent.ply", "patient=patient.yaml"),
+            ("volume", "lump", "bent.ply", "patient.yaml"),
+            ("volume/volume.nrrd", "lump/mass0.ply", "bent.ply"), ("patient.yaml",)),
+    Command("import-results", ("folder=archived",), ("archived",), ("archived/volume.dcm",)),  # the others may be missing
     Command("import", ("layout=us_calibration", "folder=sets"), ("sets",),
             ("sets/data1/UScrop/US3.png",)),
     Command("import", ("layout=stereo_basler", "folder=sets/data1"), ("sets",), ("sets/data1/UScrop/US3.png",)),
@@ -345,6 +350,9 @@ def _write_small_ones(folder: Path) -> None:
     np.savez(folder / "small.npz", points=np.zeros((7, 3)), pixels=np.zeros((7, 2)))
     messages = igtl_peers.all_kinds(np.random.default_rng(0))
     (folder / "small.igtl").write_bytes(b"".join(igtl_messages.pack(one, 1 + k % 2) for k, one in enumerate(messages)))
+    (folder / "archived").mkdir(exist_ok=True)
+    made_results.written(folder / "archived")
+    (folder / "patient.yaml").write_text('name: Doe^Jane\ndate: "20261130"\naxes: [left, feet, back]\n', encoding="utf-8")
     torch.save({"weight": torch.zeros(3, 2), "bias": torch.zeros(3)}, folder / "small.pt")
 
 

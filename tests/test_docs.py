@@ -46,9 +46,9 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "freehand": {"sequence.igs.mha"},
     "import": {""},
     "import-sweep": {""},
-    "export": {"screen", "poses.csv"},  # of layout=screen
+    "export": {"", "screen", "poses.csv"},  # of layout=dicom and screen
     "describe": {""},
-    "reconstruct": {"", "optics/optics.yaml"},
+    "reconstruct": {"", "optics/optics.yaml", "volume/scan", "masses/scan", "surface"},
 }
 WRITTEN = ("out", "document", "log", "record")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
@@ -67,7 +67,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     },
     "freehand.md": {f"{folder}/capture" for folder in ("wires", "wall", "ball", "bottom", "sweep", "tank")}
     | {"scan.dcm", "poses.csv", "pairs.csv", "config.xml", "fcal.xml", "probe/probe.yaml", "surface/surface.ply"}
-    | {"session", "tip/tip.yaml"}
+    | {"session", "tip/tip.yaml", "patient.yaml"}
     | {f"{name}.igs.mha" for name in ("sweep", "bottom", "wires", "rows", "stylus")},
     "live.md": {"session", "morning"}
     | {f"outputs/live/{name}" for name in ("result/surface/surface.ply", "result/masses/scan", "capture/calibration/optics.yaml")}

@@ -31,8 +31,8 @@ class Settings(Part):
 
     layout: Annotated[str, PlainValidator(_known)] = "meza2021"
     """meza2021: the rig authors' data sets; us_calibration: sets for their calibration of the probe; markerpose: their networks'
-    training data, and their example's; screen: a scanner's recording, for import-sweep; a program's name, such as kalibr, ros,
-    mrcal, slstudio: the calibration of cameras and projector alone"""
+    training data, and their example's; screen: a scanner's recording, for import-sweep; dicom: results for a hospital's archive;
+    a program's name, such as kalibr, ros, mrcal, slstudio: the calibration of cameras and projector alone"""
     capture: Folders = Field(default=[])
     """a capture folder, which meza2021 and screen need; of a sweep one with poses, as `sonotwin track` leaves it. us_calibration
     takes several, a set each: [first,second]"""
@@ -41,7 +41,8 @@ class Settings(Part):
     calibration: Path | None = None
     """file: cameras and projector, in place of the capture's own; enough for a calibration alone"""
     surface: Path | None = None
-    """folder of `sonotwin surface`, whose points make the mask; null takes all pixels"""
+    """folder of `sonotwin surface`, whose points make the mask; null takes all pixels. dicom takes its surface without the table,
+    or a .ply as it is; null writes none"""
     sweep: str = ""
     """its name, of a capture that holds several; "" takes the only one for the volume, or for the probe of us_calibration"""
     implausible: Implausible = "refuse"
@@ -58,7 +59,12 @@ class Settings(Part):
     tissue_m_s: Speed | None = None
     """m/s, of sound for which US_params.npz is to be right; null leaves it as the probe is calibrated"""
     masses: Path | None = None
-    """folder of `sonotwin segment`, whose masses make USmasks/; null writes none"""
+    """folder of `sonotwin segment`, whose masses make USmasks/, or segments, surfaces and report of dicom; null writes none"""
+    volume: Path | None = None
+    """folder of `sonotwin freehand`, which dicom needs, or a volume's file"""
+    patient: Path | None = None
+    """YAML file of dicom: name, id, birth_date, sex, accession_number, date ..., all of which may be left out;
+    null names nobody"""
     data: Folders = Field(default=[])
     """data sets of `sonotwin dataset`, one or several, for markerpose"""
     networks: Folders = Field(default=[])

@@ -11,6 +11,11 @@ of their networks: of data sets, data_centers.csv with images/, patch120/ and ma
 images/L, R and StereoParams.xml. `layout=screen` is a scanner's own recording: screen/ of whole screens, with the B-scan in its
 place and a clock, and poses.csv, the tracker's table; prints the command by which `sonotwin import-sweep` reads them back.
 
+`layout=dicom` is for a hospital's archive, of results instead of a capture: one study of volume.dcm (Enhanced US Volume),
+masses.dcm (Segmentation), surfaces.dcm (Surface Segmentation) and report.dcm (Comprehensive 3D SR, by TID 1500), as far as there
+are masses and a surface. It names nobody but by a file that is given as `patient`; the same results have the same identifiers.
+`sonotwin import-results` reads it back.
+
 Reads a capture folder, of a sweep with poses, as `sonotwin track` and `sonotwin reconstruct` leave it, and results of other verbs
 for what a capture doesn't hold. B-scans without a pose are left out, but of a recording. Writes into the folder `out`; an earlier
 export there is replaced whole, and nothing else ever is. Takes seconds.
@@ -23,6 +28,7 @@ export there is replaced whole, and nothing else ever is. Takes seconds.
     sonotwin export layout=markerpose data=outputs/data out=for_their_training
     sonotwin export layout=markerpose capture=outputs/film/capture networks=[detector,segmenter] out=for_their_example
     sonotwin export layout=screen capture=outputs/sweep/capture out=recording
+    sonotwin export layout=dicom volume=result/volume/scan masses=result/masses/scan surface=result/surface out=for_archive
 """
 
 from recon import registry
@@ -47,7 +53,8 @@ def run(config: Config) -> None:
         `out` can't be written to.
     """
     console = LineConsole()
-    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses, *config.data, *config.networks)
+    given = (*config.capture, config.calibration, config.surface, config.probe, config.masses, config.volume, config.patient)
+    given += (*config.data, *config.networks)
     atomic.check_folder(config.out, "export", inputs=given)
     of_cameras = config.layout in calibration_files.written()
     kind = exported_cameras if of_cameras else registry.kind(export_layouts.__name__, config.layout)
