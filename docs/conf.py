@@ -4,6 +4,7 @@ The source folder is the repository's root, so that links between these pages ar
 """
 
 import inspect
+import logging
 import re
 import sys
 from collections.abc import Callable
@@ -92,6 +93,13 @@ def _escaped(line: str) -> str:
     return "".join(parts)
 
 
+def imported(app: Sphinx, what: str, name: str, found: object, skipped: bool, options: object) -> bool | None:
+    """Skip what a module imports: autodoc leaves it out, too, but has read its signature and source by then, for each module."""
+    module = app.env.current_document.autodoc_module
+    of_others = (inspect.isclass(found) or inspect.isfunction(found)) and found.__module__ not in (None, module)
+    return True if what == "module" and of_others else None
+
+
 def short_types(app: Sphinx, what: str, name: str, found: object, options: object, signature: str, returned: str) -> tuple:
     """Write NumPy's long array types as Array and ArrayLike."""
     short = (None if text is None else ARRAY_LIKE.sub("ArrayLike", ARRAY.sub("Array", text)) for text in (signature, returned))
@@ -170,11 +178,13 @@ def setup(app: Sphinx) -> None:
     """Connect the steps above."""
     import site_pages  # of this folder
 
+    logging.getLogger("sphinx").setLevel(logging.INFO)  # else a record for each of a quarter of a million events
     inspect.getsource = cache(inspect.getsource)  # autodoc looks for each default's text in it, and parses a class's whole file
     app.add_domain(ShortNames, override=True)
     app.add_directive("accuracy-rows", site_pages.AccuracyRows)
     app.add_directive("rooms", site_pages.Rooms)
     app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
+    app.connect("autodoc-skip-member", imported)
     app.connect("autodoc-process-signature", short_types)
     app.connect("html-page-context", tree_of_titles, priority=100)  # before the theme draws the tree
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
