@@ -3,13 +3,18 @@
 The source folder is the repository's root, so that links between these pages are the same on the site and on a forge.
 """
 
+import inspect
+import logging
 import re
 import sys
+from collections.abc import Callable
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.domains.python import ObjectEntry, PythonDomain
 
@@ -43,6 +48,7 @@ autodoc_default_options = {
 }
 suppress_warnings = ["ref.python"]  # a docstring's short name, such as Noise, may be that of several classes: then it is no link
 autodoc_preserve_defaults = True
+autodoc_use_type_comments = False  # there are none, and each function's source would be parsed for them
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
@@ -85,6 +91,13 @@ def _escaped(line: str) -> str:
         else:
             parts[k] = re.sub(r"([*|`])|(?<=\w)(_)(?!\w)", lambda match: f"\\{match[0]}", part)
     return "".join(parts)
+
+
+def imported(app: Sphinx, what: str, name: str, found: object, skipped: bool, options: object) -> bool | None:
+    """Skip what a module imports: autodoc leaves it out, too, but has read its signature and source by then, for each module."""
+    module = app.env.current_document.autodoc_module
+    of_others = (inspect.isclass(found) or inspect.isfunction(found)) and found.__module__ not in (None, module)
+    return True if what == "module" and of_others else None
 
 
 def short_types(app: Sphinx, what: str, name: str, found: object, options: object, signature: str, returned: str) -> tuple:
@@ -134,15 +147,46 @@ class ShortNames(PythonDomain):
             self._alike = None
 
 
+@cache
+def titles(app: Sphinx) -> dict[str, nodes.bullet_list]:
+    """Tables of contents of all pages, which are read by then, without what is on the pages: titles and pages below them."""
+    found = {page: contents.deepcopy() for page, contents in app.env.tocs.items()}
+    for entry in (entry for contents in found.values() for entry in contents if len(entry) > 1):
+        if pages := list(entry.findall(addnodes.toctree)):
+            entry[1][:] = pages
+        else:
+            entry.pop(1)
+    return found
+
+
+def tree_of_titles(app: Sphinx, page: str, template: str, context: dict, document: nodes.document | None) -> None:
+    """Make a page's tree of all pages from their titles: Sphinx copies all that is on them, then drops it, for each page anew."""
+    whole: Callable[..., str] = context["toctree"]
+
+    def tree(**options: object) -> str:
+        kept = app.env.tocs
+        app.env.tocs = titles(app) if options.get("titles_only") else kept
+        try:
+            return whole(**options)
+        finally:
+            app.env.tocs = kept
+
+    context["toctree"] = tree
+
+
 def setup(app: Sphinx) -> None:
     """Connect the steps above."""
     import evidence_pages  # of this folder
     import site_pages
 
+    logging.getLogger("sphinx").setLevel(logging.INFO)  # else a record for each of a quarter of a million events
+    inspect.getsource = cache(inspect.getsource)  # autodoc looks for each default's text in it, and parses a class's whole file
     app.add_domain(ShortNames, override=True)
     app.add_directive("accuracy-rows", site_pages.AccuracyRows)
     app.add_directive("rooms", site_pages.Rooms)
     evidence_pages.connect(app)
     app.connect("autodoc-process-docstring", as_rst, priority=100)  # before napoleon
+    app.connect("autodoc-skip-member", imported)
     app.connect("autodoc-process-signature", short_types)
+    app.connect("html-page-context", tree_of_titles, priority=100)  # before the theme draws the tree
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

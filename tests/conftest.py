@@ -29,6 +29,15 @@ logging.getLogger("recon.compiled").setLevel(logging.WARNING)  # verbs announce 
 gc.disable()  # until all tests are collected: of these 8 000 and of modules nothing is garbage
 
 
+@pytest.hookimpl(trylast=True)  # of those that are selected
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin each worker's half with its slow tests: at the end one takes quick ones from the other, and neither waits long."""
+    slow, quick = ([item for item in items if (item.get_closest_marker("slow") is None) == fast] for fast in (False, True))
+    first = len(slow) // 2
+    rest = max(len(items) // 2 - first, 0)
+    items[:] = [*slow[:first], *quick[:rest], *slow[first:], *quick[rest:]]
+
+
 def pytest_collection_finish() -> None:
     """Collect garbage from now on, but look through none of what stays to the end."""
     gc.freeze()

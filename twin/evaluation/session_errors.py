@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from recon.capture import calibration_files, lag_files, manifest, probe_files, sweep_part
 from recon.capture.manifest import CAMERAS, OPTICS, SCANNER, PartName
 from recon.capture.manifest import sweep_part as sweep_path
-from recon.files import metrics
+from recon.files import meshes, metrics
 from recon.files.metrics import Metrics
 from recon.files.npz import Form
 from recon.freehand import place_uncertainty
@@ -91,8 +91,8 @@ def findings(result: Path, true: SweepTruth, name: str) -> list[Finding]:
     """The true masses of a sweep, each with its match among those that were found in it; InputError if a file is missing."""
     folder = result / "masses" / name
     count = int(metrics.read(folder / metrics.FILE)["masses"])
-    meshes = [trimesh.load_mesh(folder / f"mass{number}.ply", process=False) for number in range(count)]
-    return sweep_errors.compare(meshes, true.hidden)
+    found = [meshes.read_ply(folder / f"mass{number}.ply", "a mass") for number in range(count)]
+    return sweep_errors.compare(found, true.hidden)
 
 
 def optics(found: Calibration, truth: Path) -> Metrics:
@@ -157,7 +157,7 @@ def contact_bias(world_from_pixel: Array, true: SweepTruth, surface: Path) -> fl
     world_from_pixel : (n, 4, 4)
         By the estimated calibrations and tracked poses; NaN without a pose.
     """
-    measured = trimesh.load_mesh(surface, process=False)
+    measured = meshes.read_ply(surface, "a surface")
     flat = np.zeros((FACE_POINTS, 4))
     flat[:, 0], flat[:, 3] = np.linspace(0, true.transducer.image_size[0] - 1, FACE_POINTS), 1
     placed = np.isfinite(world_from_pixel).all(axis=(1, 2))
