@@ -181,7 +181,7 @@ def _listed(symbols: Sequence[str]) -> str:
 
 
 def _figures(found: Acceptance) -> list[tuple[str, str, str]]:
-    numbers = [(symbol, in_words(one.budget).removesuffix(" mm"), "mm") for symbol, one in found.worst_values.items()]
+    numbers = [(symbol, f"{one.budget.value_mm:.3f}".replace("-", "−"), "mm") for symbol, one in found.worst_values.items()]
     return [*numbers, ("demands met", f"{sum(one.met for one in found.demands)} of {len(found.demands)}", "")]
 
 

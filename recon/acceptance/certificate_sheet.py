@@ -28,7 +28,7 @@ SECTION = ParagraphStyle("section", TEXT, fontName=BOLD, fontSize=11, leading=14
 class _Against(Flowable):
     """A quantity in all places against its limit: marks with bars of uncertainty between minus and plus the limit."""
 
-    WIDTH, HEIGHT = 128.0, 15.0
+    WIDTH, HEIGHT = 118.0, 15.0
     REACH = 1.5  # limits, to both sides
 
     def __init__(self, values: Sequence[Judged]) -> None:
@@ -93,13 +93,13 @@ def _content(found: Acceptance, subject: Subject) -> list[Flowable]:
         for symbol, one in found.worst_values.items()
     ]  # fmt: skip
     head = ("", "quantity", "ISO 10360-13", "worst ± U (95 %)", "limit", "decision", "all places, − limit to + limit")
-    budgets = [Paragraph("Uncertainty budgets, of the places that decide", SECTION)]
-    tables: list[Flowable] = []
+    tables = list[Flowable]()
     for symbol, one in found.worst_values.items():
         lines = [[_p(cell) for cell in row] for row in certificate_page.budget_rows(one.budget)]
         table = _table(BUDGET_HEAD, lines, (128, 74, 68, 68, 52, 58, 52))
         title = Paragraph(f"{symbol} at {one.place}", ParagraphStyle("of", CELL, fontName=BOLD, spaceBefore=6, spaceAfter=2))
-        tables += [KeepTogether([title, table, Paragraph(certificate_page.budget_summary(one).replace("−", "-"), SMALL)])]
+        above = [] if tables else [Paragraph("Uncertainty budgets, of the places that decide", SECTION)]
+        tables += [KeepTogether([*above, title, table, Paragraph(certificate_page.budget_summary(one).replace("−", "-"), SMALL)])]
     demands = [[_p(cell) for cell in row] for row in certificate_page.demand_rows(found)]
     artefacts = [[_p(cell) for cell in row] for row in certificate_page.artefact_rows(subject.artefacts)]
     signed = [[_p(name), _p("" if value == UNSIGNED else value)] for name, value in certificate_page.signature_rows(subject)]
@@ -109,12 +109,11 @@ def _content(found: Acceptance, subject: Subject) -> list[Flowable]:
         Spacer(0, 4),
         Paragraph(_safe(certificate_page.verdict(found)), RESULT),
         Paragraph("Test values", SECTION),
-        _table(head, rows, (26, 118, 72, 80, 38, 42, _Against.WIDTH)),
+        _table(head, rows, (28, 104, 72, 82, 38, 43, _Against.WIDTH)),
         KeepTogether([Paragraph("Signed", SECTION), _table(("", ""), signed, (90, width - 90), high=19)]),
         KeepTogether([Paragraph("Artefacts", SECTION), _table(ARTEFACT_HEAD, artefacts, (160, 120, 120)),
                       Paragraph(certificate_page.room(subject.artefacts), SMALL)]),
         KeepTogether([Paragraph("Arrangement", SECTION), _table(DEMAND_HEAD, demands, (220, 160, 60))]),
-        *budgets,
         *tables,
         KeepTogether([Paragraph("How to read this", SECTION), *[Paragraph(_safe(text), SMALL) for text in READING]]),
     ]  # fmt: skip

@@ -28,7 +28,7 @@ def test_a_few_outliers_are_let_go(rng):
 
 
 def test_the_width_of_all_grows_with_the_points_and_that_of_most_does_not(rng):
-    """Ranges of 100 and 10 000 normal numbers are 5.0 and 7.7 sigma; 95 % of them lie within 3.92 sigma, whatever their number."""
+    """Ranges of 100 and 10 000 normal numbers are 5.0 and 7.7 sigma; 95 % lie within 3.92 sigma, however many there are."""
     few, many = (np.mean([shell_width(rng.standard_normal(n), 1.0) for _ in range(60)]) for n in (100, 10_000))
     assert few == pytest.approx(5.0, abs=0.3) and many == pytest.approx(7.7, abs=0.3)
     assert shell_width(rng.standard_normal(40_000), MOST) == pytest.approx(2 * stats.norm.ppf(0.975), abs=0.08)

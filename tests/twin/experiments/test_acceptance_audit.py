@@ -1,4 +1,4 @@
-"""Acceptance tests of drawn rigs: intervals hold the truth, good rigs are accepted, bad ones rejected. `study` draws a thousand."""
+"""Acceptance tests of drawn rigs: intervals hold the truth, good rigs are accepted, bad ones rejected."""
 
 import numpy as np
 import pytest
