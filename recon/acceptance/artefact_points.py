@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from recon.acceptance.certificates import Artefacts, BarCertificate
 from recon.errors import InputError
@@ -25,6 +25,7 @@ class Region:
     rod_deg: float = 10.0  # around a bar's rod, from its surface, as seen from the ball's centre
     near: float = 0.1  # of a ball's radius, from its surface: farther points are none of its
     near_mm: float = 2.0  # from a plane
+    border_mm: float = 5.0  # of a plane, from its outline inwards, that is left out: pixels there see its edge, too
     least: int = 200  # points of an artefact
     most: int = 20_000  # that are fitted, evenly out of more
     votes: int = 2000  # points that vote
@@ -72,13 +73,21 @@ def plate(points: Array, name: str, rng: np.random.Generator, region: Region = R
         for _ in range(2):
             if own.sum() >= region.least:
                 own = np.abs(fit_plane(points[own]).shape.distance(points)) < region.near_mm
-        return _thinned(points[_enough(np.flatnonzero(own), name, region)], region)
+        return _thinned(_within(points[_enough(np.flatnonzero(own), name, region)], region.border_mm), region)
     raise InputError(f"{name}: expected a plane of {region.least} points or more, found {len(points)}")
 
 
 def expected(artefacts: Artefacts) -> tuple[str, ...]:
     """Names of the folders of an acceptance test, by the artefacts that there are."""
     return tuple(kind for kind in ("sphere", "bar", "plane") if getattr(artefacts, kind) is not None)
+
+
+def _within(points: Array, border_mm: float) -> Array:
+    """Those of a plane's points : (n, 3) that are farther than a border from their convex outline."""
+    away = points - points.mean(axis=0)
+    across = away @ np.linalg.svd(away, full_matrices=False)[2][:2].T
+    sides = ConvexHull(across).equations
+    return points[(across @ sides[:, :2].T + sides[:, 2]).max(axis=1) < -border_mm]
 
 
 def _thinned(points: Array, region: Region) -> Array:

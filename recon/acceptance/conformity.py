@@ -11,9 +11,9 @@ Decision = Literal["accepted", "rejected", "neither"]
 class Limits(Part):
     """Maximum permissible errors (MPE) of a rig; a test whose limit is null is reported without a decision."""
 
-    pf_mm: Positive | None = 0.2
+    pf_mm: Positive | None = 0.3
     """PF, probing error of form: width of the shell around all points of a sphere, less the worst 3 in 1000"""
-    pf95_mm: Positive | None = 0.12
+    pf95_mm: Positive | None = 0.2
     """P[Form.Sph.D95%], the same around 95 % of the points"""
     ps_mm: Positive | None = 0.1
     """PS, P[Size.Sph.All], probing error of size: fitted less certified diameter"""
@@ -21,9 +21,9 @@ class Limits(Part):
     """SD, sphere-spacing error: distance of the balls' centres less the certified one"""
     e_mm: Positive | None = 0.2
     """E, length measurement error: length over both balls, from end to end, less the certified one"""
-    f_mm: Positive | None = 0.3
+    f_mm: Positive | None = 0.4
     """F, flatness measurement error: distance of two planes around all points of a plane, less the worst 3 in 1000"""
-    f95_mm: Positive | None = 0.2
+    f95_mm: Positive | None = 0.25
     """the same around 95 % of the points"""
 
 

@@ -19,7 +19,7 @@ from recon.capture import surface_part
 from recon.capture.manifest import MANIFEST
 from recon.errors import InputError
 from recon.files import atomic, meshes
-from recon.model.part import Part
+from recon.model.part import NotNegative, Part
 from recon.registry import Choice
 from recon.session import skin_step
 from recon.session.watch import SILENT, Watch
@@ -45,6 +45,8 @@ class Settings(Part):
     """calibration file, used instead of the captures' own"""
     cap_deg: Annotated[float, Field(ge=20, le=85)] = 50.0
     """deg, half angle of the part of a ball that is taken, from the middle of what is seen: at its rim fringes thin out"""
+    border_mm: NotNegative = 5.0
+    """mm, of a plane, from its outline inwards, that is left out: pixels there see its edge, too"""
     instrument: Annotated[str, Field(max_length=200)] = ""
     """the rig, for the page; "" takes the captures' folder"""
     operator: Annotated[str, Field(max_length=200)] = ""
@@ -97,7 +99,7 @@ def places_of(folder: Path, artefacts: Artefacts) -> dict[str, dict[str, Path]]:
 
 def measure(settings: Settings, places: Mapping[str, Mapping[str, Path]], watch: Watch) -> Measured:
     """Points of the artefacts in all places."""
-    region, rng = Region(cap_deg=settings.cap_deg), np.random.default_rng(settings.seed)
+    region, rng = Region(cap_deg=settings.cap_deg, border_mm=settings.border_mm), np.random.default_rng(settings.seed)
     found: dict[str, dict[str, Any]] = {"sphere": {}, "bar": {}, "plane": {}}
     total = sum(map(len, places.values()))
     for name, path in watch.follow([pair for own in places.values() for pair in own.items()], total, "measuring"):

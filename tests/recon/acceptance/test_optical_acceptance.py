@@ -70,11 +70,11 @@ def test_a_perfect_rig_has_no_errors_beside_its_noise(rng):
 
 
 def test_errors_that_were_put_in_are_found(rng):
-    """A diameter 0.05 mm too large, a spacing 0.08 mm too long, and a sag of 0.4 mm; E has both."""
-    found = judged(measured(rng, size=0.05, spacing=0.08, sag=0.4, places=3))
+    """A diameter 0.05 mm too large, a spacing 0.08 mm too long, and a sag of 0.6 mm; E has both."""
+    found = judged(measured(rng, size=0.05, spacing=0.08, sag=0.6, places=3))
     assert mean(found, "PS") == pytest.approx(0.05, abs=0.006)
     assert mean(found, "SD") == pytest.approx(0.08, abs=0.006) and mean(found, "E") == pytest.approx(0.13, abs=0.01)
-    assert mean(found, "F") == pytest.approx(0.4, abs=0.08)
+    assert mean(found, "F") == pytest.approx(0.6, abs=0.08)
     assert found.decision_of("F") == "rejected" and found.decision_of("SD") == "accepted" and found.decision == "rejected"
 
 
