@@ -60,9 +60,12 @@ def test_meshes_are_certified(scanned, tmp_path, capsys):
 
 
 def test_stricter_limits_decide_otherwise(scanned, tmp_path):
-    """Noise of 0.01 mm makes a form error of 0.06 mm: rejected at 0.03; without limits it is reported."""
+    """Noise of 0.01 mm makes a form error of 0.06 mm: rejected at 0.03."""
     assert certify(scanned, tmp_path / "strict", "limits.pf_mm=0.03") == 1
     assert json.loads((tmp_path / "strict/certificate.json").read_text())["decision"] == "rejected"
+
+
+def test_without_limits_values_are_reported(scanned, tmp_path):
     none = [f"limits.{name}_mm=null" for name in ("pf", "pf95", "ps", "sd", "e", "f", "f95")]
     assert certify(scanned, tmp_path / "none", *none) == 0
     record = json.loads((tmp_path / "none/certificate.json").read_text())
