@@ -12,7 +12,7 @@ from recon.files import meshes
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
 from tests.recon.acceptance import drawn_surfaces
-from tests.twin.small_rigs import half, half_as_fields
+from tests.twin.small_rigs import half_as_fields
 
 SIGMA = 0.01
 FILES = {"certificate.html", "certificate.pdf", "certificate.json"}
@@ -105,14 +105,15 @@ def test_artefacts_that_are_left_out_are_not_needed(scanned, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_rendered_artefacts_are_certified(tmp_path, capsys):
-    """A sphere alone, in ten places, by cameras of a quarter of the size: all demands are met, and sizes are right."""
-    small = [*half_as_fields(half(read_rig())), "tracing.samples=2"]
-    assert main(["render-artefacts", *small, "artefacts.bar=null", "artefacts.plane=null", f"out={tmp_path / 'in'}"]) == 0
-    assert sorted(path.name for path in (tmp_path / "in/sphere").iterdir()) == [f"{k:02d}" for k in range(10)]
-    certified = ["artefacts.bar=null", "artefacts.plane=null", f"capture={tmp_path / 'in'}"]
-    assert main(["certify", *certified, f"out={tmp_path / 'out'}"]) in (0, 1)
-    sizes = [one for one in json.loads((tmp_path / "out/certificate.json").read_text())["values"] if one["quantity"] == "PS"]
-    assert len(sizes) == 10
-    assert all(abs(one["value_mm"]) < 0.05 for one in sizes)
+def test_a_rendered_bar_is_certified(tmp_path, capsys):
+    """In seven places, by cameras of half the size: all demands are met, and lengths are right to 0.01 mm, 1.5 U."""
+    small = [*half_as_fields(read_rig()), "tracing.samples=2"]
+    alone = ["artefacts.sphere=null", "artefacts.plane=null"]
+    assert main(["render-artefacts", *small, *alone, f"out={tmp_path / 'in'}"]) == 0
+    assert sorted(path.name for path in (tmp_path / "in/bar").iterdir()) == [f"{k:02d}" for k in range(7)]
+    assert main(["certify", *alone, f"capture={tmp_path / 'in'}", f"out={tmp_path / 'out'}"]) in (0, 1)
+    values = json.loads((tmp_path / "out/certificate.json").read_text())["values"]
+    spacings = [one for one in values if one["quantity"] == "SD"]
+    assert len(spacings) == 7
+    assert all(abs(one["value_mm"]) < 0.01 for one in spacings), spacings
     assert "demand" not in capsys.readouterr().out
