@@ -41,6 +41,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "calibrate-target": {"target.yaml"},
     "identify": {"", "rig.yaml", "conditions.yaml", "ultrasound.yaml"},
     "compare-twin": {"", "report.html"},
+    "render-artefacts": {""},
     "calibrate-tip": {"tip.yaml"},
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},

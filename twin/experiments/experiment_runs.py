@@ -50,9 +50,11 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "seen": "twin.experiments.seen_trial",
     "identify": "twin.experiments.identify_trial",
     "training": "twin.experiments.training_trial",
+    "acceptance": "twin.experiments.acceptance_audit",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
+Fault = Literal["none", "noise", "scale", "bend"]
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "mitsuba", "drjit", "onnxruntime")
 
 
@@ -79,6 +81,12 @@ class SeenTissue(Part):
     tissue: Literal["silicone", "patients"] = "silicone"
 
 
+class AcceptedRig(Part):
+    """A rig whose acceptance is tested."""
+
+    fault: Fault = "none"  # noise, a scale or a bend make errors of twice the limit
+
+
 class Settings(Part):
     """All that experiments are made from; as in `conf/study.yaml`."""
 
@@ -98,6 +106,7 @@ class Settings(Part):
     ultrasound: Transducer = Transducer()
     masses: MassCondition = MassCondition()
     seen: SeenTissue = SeenTissue()
+    acceptance: AcceptedRig = AcceptedRig()
     ranges: DataRanges
 
     @model_validator(mode="after")

@@ -1,0 +1,234 @@
+"""The optical tests: from points of artefacts in their places to test values with budgets, decisions and a verdict.
+
+The measurand of a test value is the rig's error of indication in that place: what another measurement there would show in the
+mean. So the noise of this one counts as uncertainty (type A), which ISO 14253-5 would leave out, where the error of this one
+measurement is meant; its share stands in each budget. Errors of the rig's calibration are what is tested, and no uncertainty.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.acceptance import gum_budget, prescribed_places
+from recon.acceptance.certificates import Artefacts, Certified, Material
+from recon.acceptance.conformity import Decision, Limits, decide, together
+from recon.acceptance.form_probing import REPEATS, Probed, probe_plane, probe_sphere
+from recon.acceptance.gum_budget import DRAWS, Budget, Input
+from recon.acceptance.prescribed_places import Demand
+from recon.geometry.primitives import Plane, Sphere
+
+Array = NDArray[np.float64]
+
+REFERENCE_C = 20.0  # of certificates (ISO 1)
+
+
+class Characteristic(NamedTuple):
+    """A quantity that is tested."""
+
+    title: str
+    iso: str  # the nearest quantity of ISO 10360-13, or ""
+    limit: str  # field of `Limits`
+
+
+CHARACTERISTICS = {
+    "PF": Characteristic("probing error of form, all points but 3 in 1000", "", "pf_mm"),
+    "PF95": Characteristic("probing error of form, 95 % of the points", "P[Form.Sph.D95%]", "pf95_mm"),
+    "PS": Characteristic("probing error of size", "P[Size.Sph.All]", "ps_mm"),
+    "SD": Characteristic("sphere-spacing error", "D[CC]", "sd_mm"),
+    "E": Characteristic("length measurement error, over both balls", "", "e_mm"),
+    "F": Characteristic("flatness measurement error, all points but 3 in 1000", "", "f_mm"),
+    "F95": Characteristic("flatness measurement error, 95 % of the points", "P[Form.Pla.D95%]", "f95_mm"),
+}
+
+
+class Measured(NamedTuple):
+    """Points of the artefacts : (n, 3) mm, by the names of their places."""
+
+    spheres: Mapping[str, Array]
+    bars: Mapping[str, tuple[Array, Array]]
+    planes: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A test in one place."""
+
+    symbol: str  # of CHARACTERISTICS
+    place: str
+    points: int
+    budget: Budget
+    limit_mm: float | None
+    decision: Decision | None  # None without a limit
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """All tests of a rig."""
+
+    values: tuple[Judged, ...]
+    demands: tuple[Demand, ...]
+    middles: Mapping[str, Array]  # of each kind of artefact (n, 3) mm, as measured
+
+    @property
+    def complete(self) -> bool:
+        """Whether all demands on the arrangement are met."""
+        return all(one.met for one in self.demands)
+
+    @property
+    def decision(self) -> Decision:
+        """On the rig, by all values that have a limit: rejected where one is, accepted where all are."""
+        return together(one.decision for one in self.values if one.decision is not None)
+
+    @property
+    def worst_values(self) -> dict[str, Judged]:
+        """Of each quantity the value that decides: the largest together with its uncertainty."""
+        found = dict[str, Judged]()
+        for one in sorted(self.values, key=lambda one: abs(one.budget.value_mm) + one.budget.expanded_mm):
+            found[one.symbol] = one
+        return {symbol: found[symbol] for symbol in CHARACTERISTICS if symbol in found}
+
+    def decision_of(self, symbol: str) -> Decision | None:
+        """On a quantity in all its places; None without a limit."""
+        own = [one.decision for one in self.values if one.symbol == symbol and one.decision is not None]
+        return together(own) if own else None
+
+
+def judge(
+    measured: Measured, artefacts: Artefacts, limits: Limits, seed: int = 0, draws: int = DRAWS, repeats: int = REPEATS
+) -> Acceptance:
+    """Test values in all places, with decisions.
+
+    Parameters
+    ----------
+    seed : of Monte Carlo and bootstrap
+
+    Raises
+    ------
+    ValueError
+        If points of a sphere lie in a plane.
+    """
+    rng, values = np.random.default_rng(seed), list[Judged]()
+    middles: dict[str, list[Array]] = {}
+
+    def add(test: str, place: str, points: int, model: gum_budget.Model, inputs: list[Input]) -> None:
+        budget, limit = gum_budget.evaluate(model, inputs, rng, draws), getattr(limits, CHARACTERISTICS[test].limit)
+        decision = None if limit is None else decide(budget.value_mm, budget.expanded_mm, limit)
+        values.append(Judged(test, place, points, budget, limit, decision))
+
+    def forms(tests: tuple[str, str], place: str, found: Probed[Sphere] | Probed[Plane], form_mm: float) -> None:
+        for test, width in zip(tests, (found.all, found.most), strict=True):
+            add(test, place, len(found.residuals), _form, form_inputs(width.mm, width.sigma_mm, form_mm))
+
+    for place, points in measured.spheres.items():
+        assert artefacts.sphere is not None
+        found = probe_sphere(points, rng, repeats)
+        forms(("PF", "PF95"), place, found, artefacts.sphere.form_mm)
+        add("PS", place, len(points), _size, size_inputs(found, artefacts))
+        middles.setdefault("sphere", []).append(found.shape.centre)
+    for place, (first, second) in measured.bars.items():
+        balls = probe_sphere(first, rng, 2), probe_sphere(second, rng, 2)
+        count = len(first) + len(second)
+        add("SD", place, count, _spacing, spacing_inputs(balls, artefacts))
+        add("E", place, count, _length, length_inputs(balls, artefacts))
+        middles.setdefault("bar", []).append((balls[0].shape.centre + balls[1].shape.centre) / 2)
+    for place, points in measured.planes.items():
+        assert artefacts.plane is not None
+        found = probe_plane(points, rng, repeats)
+        forms(("F", "F95"), place, found, artefacts.plane.form_mm)
+        middles.setdefault("plane", []).append(points.mean(axis=0))
+    order = {test: number for number, test in enumerate(CHARACTERISTICS)}
+    values.sort(key=lambda one: order[one.symbol])
+    placed = {kind: np.array(found) for kind, found in middles.items()}
+    return Acceptance(tuple(values), tuple(prescribed_places.demands(artefacts, placed)), placed)
+
+
+def form_inputs(width_mm: float, sigma_mm: float, form_mm: float) -> list[Input]:
+    """Inputs of a form error: the artefact's own form counts with half its certified value (as in ISO/TS 23165)."""
+    return [
+        Input("width of the shell", width_mm, sigma_mm, "A"),
+        Input("form of the artefact", 0.0, form_mm / 2, "B"),
+    ]
+
+
+def size_inputs(found: Probed[Sphere], artefacts: Artefacts) -> list[Input]:
+    """Inputs of a sphere's size error."""
+    assert artefacts.sphere is not None
+    radius = float(np.sqrt(found.covariance[3, 3]))
+    fitted = Input("fitted radius", found.shape.radius, radius, "A", freedom=found.freedom)
+    return [fitted, _certified("certified diameter", artefacts.sphere.diameter), *_material(artefacts.sphere, artefacts)]
+
+
+def spacing_inputs(balls: tuple[Probed[Sphere], Probed[Sphere]], artefacts: Artefacts) -> list[Input]:
+    """Inputs of a spacing error."""
+    assert artefacts.bar is not None
+    along, apart = _along(balls)
+    inputs = [
+        Input(f"centre of the {name} ball, along the bar", place, float(np.sqrt(gradient @ one.covariance @ gradient)), "A",
+              freedom=one.freedom)
+        for name, place, one, gradient in zip(("first", "second"), (0.0, apart), balls, 2 * [np.append(along, 0.0)], strict=True)
+    ]  # fmt: skip
+    material = [one for one in _material(artefacts.bar, artefacts) if one.name != "paint"]
+    return [*inputs, _certified("certified length", artefacts.bar.length), *material]
+
+
+def length_inputs(balls: tuple[Probed[Sphere], Probed[Sphere]], artefacts: Artefacts) -> list[Input]:
+    """Inputs of an error of the length over both balls."""
+    assert artefacts.bar is not None
+    along, apart = _along(balls)
+    ends = ((-1, -balls[0].shape.radius), (1, apart + balls[1].shape.radius))
+    inputs = [
+        Input(f"outer end of the {name} ball", place, float(np.sqrt(gradient @ one.covariance @ gradient)), "A",
+              freedom=one.freedom)
+        for name, (side, place), one in zip(("first", "second"), ends, balls, strict=True)
+        for gradient in [np.append(along, side)]
+    ]  # fmt: skip
+    certified = [_certified("certified length", artefacts.bar.length)]
+    certified += [_certified(f"certified diameter {k + 1}", one) for k, one in enumerate(artefacts.bar.diameters)]
+    return [*inputs, *certified, *_material(artefacts.bar, artefacts)]
+
+
+def _along(balls: tuple[Probed[Sphere], Probed[Sphere]]) -> tuple[Array, float]:
+    apart = balls[1].shape.centre - balls[0].shape.centre
+    length = float(np.linalg.norm(apart))
+    return apart / length, length
+
+
+def _certified(name: str, one: Certified) -> Input:
+    return Input(name, one.mm, one.standard_mm, "B")
+
+
+def _material(body: Material, artefacts: Artefacts) -> list[Input]:
+    """Temperature, expansion, paint and mounting."""
+    third = np.sqrt(3)
+    return [
+        Input("temperature", artefacts.temperature_c, artefacts.temperature_limit_c / third, "B", "deg C", "rectangular"),
+        Input("expansion", body.expansion_per_k, body.expansion_limit_per_k / third, "B", "1/K", "rectangular"),
+        Input("paint", body.coat_mm, body.coat_limit_mm / third, "B", shape="rectangular"),
+        Input("mounting", 0.0, body.mounting_mm, "B"),
+    ]
+
+
+def _grown(x: Mapping[str, Array]) -> Array:
+    return 1 + x["expansion"] * (x["temperature"] - REFERENCE_C)
+
+
+def _form(x: Mapping[str, Array]) -> Array:
+    return x["width of the shell"] + x["form of the artefact"]
+
+
+def _size(x: Mapping[str, Array]) -> Array:
+    return 2 * x["fitted radius"] - x["certified diameter"] * _grown(x) - 2 * x["paint"] + x["mounting"]
+
+
+def _spacing(x: Mapping[str, Array]) -> Array:
+    apart = x["centre of the second ball, along the bar"] - x["centre of the first ball, along the bar"]
+    return apart - x["certified length"] * _grown(x) + x["mounting"]
+
+
+def _length(x: Mapping[str, Array]) -> Array:
+    over = x["outer end of the second ball"] - x["outer end of the first ball"]
+    certified = x["certified length"] + (x["certified diameter 1"] + x["certified diameter 2"]) / 2
+    return over - certified * _grown(x) - 2 * x["paint"] + x["mounting"]
