@@ -50,6 +50,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "seen": "twin.experiments.seen_trial",
     "identify": "twin.experiments.identify_trial",
     "training": "twin.experiments.training_trial",
+    "session": "twin.experiments.session_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin", "trainers")  # by whose code figures are made
