@@ -12,21 +12,25 @@ The noise of camera 1, the projector's raster and the errors of a calibration wh
 light that spreads in skin, aren't. Fringes along columns, rows or both count as in the reconstruction, and Gray code alone by its
 cells. With `sessions` whole ones
 are drawn, from the board to a mass, with the errors of `conditions`: what detectors would find is drawn, and the real software
-does the rest. They say the errors of points, pixels of B-scans and masses' centres.
+does the rest. They say the errors of points, pixels of B-scans and masses' centres. With `rehearsals` the rig's twin calibrates
+its probe by crossed wires and sweeps a phantom's masses so many times, by rendered frames and B-scans, a minute each. That
+says CR1 and the errors of masses, and sessions are drawn with the noise that detectors have there, else with that of the paper's
+rig, scaled to this one.
 
     sonotwin predict
     sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700]
-    sonotwin predict conditions=lifelike sessions=24
+    sonotwin predict conditions=lifelike sessions=24 rehearsals=2
     sonotwin predict "changes={rig.projector.radiant_flux_w: {to: 1.2, price: 800}, patterns.parts.1.steps: {to: 16, price: 0}}"
 """
 
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationError
 
 from recon.errors import InputError, one_line
-from recon.model.part import Finite, NotNegative, Part
+from recon.model.part import Finite, NotNegative, Part, Positive
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from scenes.board_poses import Config as BoardPoses
@@ -35,13 +39,16 @@ from sonotwin.config import defaults
 from sonotwin.console_watch import LineConsole
 from sonotwin.experiment_settings import settings_of
 from twin.conditions import IDEAL, Conditions
-from twin.experiments import predicted_plane, predicted_session
+from twin.evaluation.surface_errors import rms
+from twin.experiments import predicted_plane, predicted_session, rehearsal
 from twin.experiments.experiment_runs import Settings
 from twin.experiments.predicted_plane import Measurement
+from twin.experiments.rehearsal import Rehearsed
 from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.ultrasound.transducer import Transducer
 
+FIVE = 5  # calibrations of which CR1 is usually told
 TOLD = 0.02  # relative change of the error by that of a number: less isn't told
 NUMBERS = (
     *(f"cam1.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
@@ -76,6 +83,8 @@ class Config(Part):
     poses: BoardPoses = BoardPoses()
     ultrasound: Transducer = Transducer()
     sessions: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_two_or_none)] = 0
+    rehearsals: Annotated[int, Field(ge=0, le=100)] = 0
+    white_dn: Positive = 65.0
     changes: dict[str, Change] = Field(default_factory=dict)
 
 
@@ -101,10 +110,8 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
     optics = "not counted (no covariance in the rig)" if rig.optics_covariance is None else f"{found.optics_mm:.4f} mm"
     parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm, calibration {optics}"
     yield f"by          {parts}; modulation {found.modulation_dn:.0f} DN, exposure {1e3 * found.exposure_s:.2f} ms"
-    if config.sessions:
-        for figure, one in predicted_session.predict(_session(config), range(config.sessions)).items():
-            of = f"of {config.sessions} drawn sessions, {one.worst:.2g} mm in the worst"
-            yield f"predicted   {predicted_session.FIGURES[figure]} {one.rms:.3f} ± {1.96 * one.sigma:.2g} mm RMS (95 %) {of}"
+    if config.rehearsals or config.sessions:
+        yield from _sessions(config, _session(config))
     for name, slope in predicted_plane.elasticities(rig, measurement_of(config), NUMBERS).items():
         if abs(slope) >= TOLD:
             sigma = f"± {rig.measured[name].sigma:.2g}" if name in rig.measured else "taken as exact"
@@ -117,6 +124,32 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
         yield f"change      {name} to {change.to:g}: {100 * less / found.rms_mm:+.1f} % less error for {change.price:g}"
 
 
+def _sessions(config: Config, session: Settings) -> Iterator[str]:
+    """Lines of rehearsed and of drawn sessions."""
+    if config.rehearsals:
+        rehearsed = rehearsal.rehearse(session, config.rehearsals, seed=0)
+        session = session.model_copy(update={"noise": rehearsal.noise_of(session, rehearsed.wires)})
+        yield from _rehearsed(rehearsed, config.rig.probe.image_size)
+    if config.sessions:
+        for figure, one in predicted_session.predict(session, range(config.sessions)).items():
+            of = f"of {config.sessions} drawn sessions, {one.worst:.2g} mm in the worst"
+            yield f"predicted   {predicted_session.FIGURES[figure]} {one.rms:.3f} ± {1.96 * one.sigma:.2g} mm RMS (95 %) {of}"
+
+
+def _rehearsed(found: Rehearsed, size: tuple[int, int]) -> Iterator[str]:
+    """Lines: CR1 and its scatter, the noise of detectors, the errors of masses."""
+    seen, scatter = found.wires.seen, rehearsal.scatter_of_cr1(found.wires, FIVE, size)
+    of = f"of {rehearsal.IMAGES} B-scans each; {100 * seen.shown:.0f} % of poses show the crossing"
+    yield f"predicted   CR1 {rehearsal.expected_cr1(found.wires, size):.3f} mm, mean of five points, {of}"
+    noise = f"circles {seen.circle_px:.3f} px, crossings {seen.crossing_px:.2f} px"
+    yield f"by          {noise}; CR1 of {FIVE} calibrations scatters by {100 * scatter:.0f} %"
+    there, (centre_mm, volume) = np.isfinite(found.masses.volume), found.masses
+    errors = "none found"
+    if there.any():
+        errors = f"centre {rms(np.linalg.norm(centre_mm[there], axis=1)):.3f} mm, volume {100 * rms(volume[there]):.0f} % RMS"
+    yield f"predicted   masses of 8 mm by segmentation alone: {errors}, {there.sum()} of {len(volume)} found"
+
+
 def measurement_of(config: Config) -> Measurement:
     """What is to be measured."""
     return Measurement(config.patterns, config.plate, config.shooting, config.tracing)
@@ -125,7 +158,8 @@ def measurement_of(config: Config) -> Measurement:
 def _session(config: Config) -> Settings:
     """The same rig in a whole session; all else as in `conf/study.yaml`."""
     names = ("rig", "conditions", "poses", "ultrasound", "patterns", "shooting", "tracing")
-    return Settings.model_validate(settings_of(defaults("study") | {name: getattr(config, name) for name in names}))
+    made = Settings.model_validate(settings_of(defaults("study") | {name: getattr(config, name) for name in names}))
+    return made.model_copy(update={"film": made.film.model_copy(update={"white_dn": config.white_dn})})
 
 
 def _worth(saved_mm: float, change: Change) -> float:

@@ -51,6 +51,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "identify": "twin.experiments.identify_trial",
     "training": "twin.experiments.training_trial",
     "acceptance": "twin.experiments.acceptance_audit",
+    "session": "twin.experiments.session_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made

@@ -21,6 +21,7 @@ from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
 from recon.model.rig import Rig
 from recon.optical_calibration.figures_of_merit import normalised_error
 from recon.session import rig_step, scanner_step
+from recon.session.rig_step import Identification
 from scenes.acoustics import TISSUES
 from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
@@ -89,7 +90,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
     array = drawn_rig.draw_scanner(np.random.default_rng([seed, 61]))
     rig = with_scanner(rig, array)
     with TemporaryDirectory() as folder:
-        identified, found = identify_recorded(rig, conditions, array, Path(folder), settings.poses.seed + seed, seed)
+        identified, found = identify_recorded(rig, conditions, array, Path(folder), settings.poses.seed + seed, seed)[:2]
     judged = judge(found, truth_of(rig, conditions, array, found))
     judged["optics_error_over_sigma"] = normalised_error(identified.calibration(), rig.calibration())
     return judged | choose_setting(rig, identified, conditions, seed)
@@ -97,11 +98,11 @@ def measure(settings: Settings, seed: int) -> Metrics:
 
 def identify_recorded(
     rig: Rig, conditions: Conditions, array: Transducer, out: Path, poses_seed: int, seed: int
-) -> tuple[Rig, Findings]:
+) -> Identification:
     """Record a rig's captures in a folder, and identify it from these and its sheet."""
     by_light = record_optics(rig, conditions, out, poses_seed, seed)
     record_sweeps(rig, array, out, seed)
-    return rig_step.identify(rig_step.Settings(**by_light, **scanner_sheet(array, seed)))[:2]
+    return rig_step.identify(rig_step.Settings(**by_light, **scanner_sheet(array, seed)))
 
 
 def record_optics(rig: Rig, conditions: Conditions, out: Path, poses_seed: int, seed: int) -> dict[str, Any]:
