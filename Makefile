@@ -1,11 +1,10 @@
 # Each target works alone on a fresh Debian or Ubuntu with Python 3.11 or newer; `make PYTHON=/path/to/python3 setup` chooses one.
-# ONLY=group restricts accuracy and benchmark to one group; ARGS="-k camera" goes to pytest, and MARKED= has it run slow tests, too.
+# ONLY=group restricts accuracy and benchmark to one group; ARGS="-k camera" goes to pytest.
 
 PYTHON ?=
 ONLY ?=
 REAL := $(or $(SONOTWIN_REAL),$(wildcard ../shared/real))
 ARGS ?=
-MARKED ?= not slow
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 TWIN := .venv/.twin
@@ -48,7 +47,7 @@ $(LIVE)/result/metrics.json: | setup
 
 test: setup  ## check style, types and arrows, then run the fast tests
 	@bash .ci/browser & browser=$$!; $(MAKE) --no-print-directory lint && wait $$browser
-	@$(PYTEST) -m "$(MARKED)" $(ARGS)
+	@$(PYTEST) -m "not slow" $(ARGS)
 
 lint: setup  ## check style, types and which package may import which
 	@$(BIN)/ruff check --quiet .
