@@ -5,11 +5,16 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from recon.estimation.covariance import root
+from recon.geometry import rigid
 from recon.geometry.camera import Camera
 from recon.geometry.camera_jacobian import DISTORTION, MATRIX, MOTION
 from recon.identification.estimates import Estimate, Findings
-from recon.model.calibration import WORLD, Calibration, with_scale
+from recon.model.calibration import WORLD, Calibration, linearise, moved, with_scale
 from recon.model.rig import DEVICES, Optics, OpticsCovariance, Pose, Rig
+from recon.optical_calibration.joint_calibration import Result
+
+Array = NDArray[np.float64]
 
 SOURCE = "calibration by a board"
 
@@ -60,6 +65,28 @@ def optics_of(camera: Camera) -> Optics:
             rotation_deg=tuple(vector.tolist()), translation_mm=tuple(camera.camera_from_world[:3, 3].tolist())
         ),
     )
+
+
+def one_sigma_off(optics: Result) -> list[tuple[dict[str, Camera], Array]]:
+    """Devices, and poses of the board : (p, 4, 4), that are one standard deviation off, along each axis of the covariance.
+
+    The poses follow the devices, so that discs stay where they were seen, as well as that goes. None without a covariance.
+    """
+    adjusted, known = optics.adjustment, optics.adjustment.calibration.uncertainty
+    if known is None:
+        return []
+    cameras, seen = adjusted.calibration.cameras, np.isfinite(adjusted.residuals).all(axis=-1)
+    answers = list[Array]()  # (6, g) of each pose
+    for pose, shown in zip(adjusted.poses, seen, strict=True):
+        by_pose, by_device = list[Array](), list[Array]()
+        for k, device in enumerate(optics.observations.devices):
+            points = adjusted.points[shown[:, k]]
+            slopes = linearise(cameras, device, rigid.apply(pose, points), known.names)
+            by_pose.append((slopes.by_point @ rigid.slopes(rigid.rotate(pose, points))).reshape(-1, 6))
+            by_device.append(slopes.by_parameter.reshape(-1, len(known.names)))
+        answers.append(-np.linalg.lstsq(np.concatenate(by_pose), np.concatenate(by_device))[0])
+    steps = root(known.covariance).T
+    return [(moved(cameras, known.names, step), rigid.moved(adjusted.poses, np.stack(answers) @ step)) for step in steps]
 
 
 def findings(calibration: Calibration) -> Findings:

@@ -26,6 +26,7 @@ class PoseFit(NamedTuple):
     kept: NDArray[np.bool_]  # (n,) no outliers
     scatter: float  # of one pose's values, over their noise; at least 1
     between: float  # standard deviation by which all values of a pose are off alike, beyond noise
+    gain: Array  # (g, n) changes of the unknowns by one of each value; 0 of outliers
 
 
 def fit_in_poses(
@@ -61,7 +62,7 @@ def fit_in_poses(
     """
     values, scatter, between, count = np.array(start, float), 1.0, 0.0, len(start)
     used = kept = np.ones(len(measured), bool)
-    covariance = np.diag(units**2)
+    covariance, gain = np.diag(units**2), np.zeros((count, len(measured)))
     for _ in range(ROUNDS):
         used, number = kept, np.unique(pose[kept], return_inverse=True)[1]
         poses = number.max() + 1
@@ -70,7 +71,10 @@ def fit_in_poses(
         problem = _Problem(measured, scatter * sigma, predict, count, used, number, scale, prior)
         ends = descend(np.append(values, np.zeros(poses)), problem.linearise, problem.move)
         values, rows = ends.estimate[:count], ends.system.slopes
-        covariance = (np.outer(scale, scale) * inverse(rows.T @ rows))[:count, :count]
+        together = np.outer(scale, scale) * inverse(rows.T @ rows)
+        covariance = together[:count, :count]
+        gain = np.zeros((count, len(measured)))
+        gain[:, used] = (together[:count] / scale) @ rows[: used.sum()].T / problem.noise[used]
         left = measured - predict(values)[0]
         weight = np.bincount(number, sigma[used] ** -2)
         mean = np.bincount(number, left[used] / sigma[used] ** 2) / weight
@@ -80,7 +84,7 @@ def fit_in_poses(
         ratio = float((mean**2 * weight).sum()) / scatter**2 / freedom
         between = float(scatter * np.sqrt((ratio - 1) / weight.mean())) if ratio > 1 + CHANCE * np.sqrt(2 / freedom) else 0.0
         kept = np.abs(left) < outlier * np.hypot(scatter * sigma, between)
-    return PoseFit(values, covariance, used, scatter, between)
+    return PoseFit(values, covariance, used, scatter, between, gain)
 
 
 class _Rows(NamedTuple):

@@ -14,8 +14,8 @@ Paper isn't quite matt. Three deviations are fitted along, each held to zero by 
 white. A pose may be brighter than the others, as lamps drift.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -69,6 +69,7 @@ class Whites:
     cosines: Array  # (n, 2) of the angles between normal and light, and normal and view
     half: Array  # (n,) of the angle between the normal and the bisector of light and view
     place: Array  # (n, 2) on the board, -1 to 1 from side to side
+    board: Array  # (n, 3) mm, in the board's frame
     pose: NDArray[np.int64]  # (n,) number of the image
 
     def __getitem__(self, chosen: NDArray) -> "Whites":
@@ -122,6 +123,23 @@ def measure_whites(
         patch = np.asarray(image[v - r : v + r + 1, u - r : u + r + 1], float)
         inside[k] = patch.max() < full
         level[k], sigma[k] = patch.mean(), np.sqrt((patch.var() + 1 / 12) / patch.size)
+    whites = Whites(
+        level, sigma, **_rays(flat, camera, projector, world_from_board), place=places, board=flat, pose=np.full(len(flat), pose)
+    )
+    return whites[inside & (whites.cosines > 0).all(axis=1)]
+
+
+def placed(whites: Whites, camera: Camera, projector: Camera, world_from_board: Mapping[int, Array]) -> Whites:
+    """The same patches, as other optics and poses, by their numbers, place them."""
+    rows = {k: np.flatnonzero(whites.pose == k) for k in world_from_board}
+    parts = [replace(whites[rows[k]], **_rays(whites.board[rows[k]], camera, projector, world_from_board[k])) for k in rows]
+    return joined(parts)[np.argsort(np.concatenate(list(rows.values())))]
+
+
+def _rays(flat: Array, camera: Camera, projector: Camera, world_from_board: Array) -> dict[str, Array]:
+    """Fields of `Whites` by the ways of light, of places : (n, 3) mm in the board's frame."""
+    world = rigid.apply(world_from_board, flat)
+    pixels, shown = camera.project(world), projector.project(world)
     normal = -world_from_board[:3, 2]  # towards the viewer
     from_camera, from_projector = world - camera.centre, world - projector.centre
     distance2 = (from_projector**2).sum(axis=1)
@@ -129,19 +147,14 @@ def measure_whites(
     cosines = np.column_stack([view @ normal for view in views])
     bisector = views[0] + views[1]
     slant, axis = rigid.apply(projector.camera_from_world, world)[:, 2] / np.sqrt(distance2), camera.camera_from_world
-    whites = Whites(
-        level,
-        sigma,
-        ((pixels - _middle(camera)) ** 2).sum(axis=1) / (_middle(camera) ** 2).sum(),
-        (rigid.apply(axis, world)[:, 2] / np.linalg.norm(from_camera, axis=1)) ** 4,
-        METRE * cosines[:, 0] / slant**3 / distance2,
-        ((shown - _middle(projector)) ** 2).sum(axis=1) / (_middle(projector) ** 2).sum(),
-        cosines,
-        bisector @ normal / np.linalg.norm(bisector, axis=1),
-        places,
-        np.full(len(flat), pose),
-    )
-    return whites[inside & (cosines > 0).all(axis=1)]
+    return {
+        "corner2": ((pixels - _middle(camera)) ** 2).sum(axis=1) / (_middle(camera) ** 2).sum(),
+        "cosine4": (rigid.apply(axis, world)[:, 2] / np.linalg.norm(from_camera, axis=1)) ** 4,
+        "light": METRE * cosines[:, 0] / slant**3 / distance2,
+        "shown2": ((shown - _middle(projector)) ** 2).sum(axis=1) / (_middle(projector) ** 2).sum(),
+        "cosines": cosines,
+        "half": bisector @ normal / np.linalg.norm(bisector, axis=1),
+    }
 
 
 def joined(parts: Sequence[Whites]) -> Whites:
@@ -149,7 +162,9 @@ def joined(parts: Sequence[Whites]) -> Whites:
     return Whites(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Whites)))
 
 
-def find_vignetting(whites: Whites, name: str = "cam1", *, black: Estimate, limits: WhiteLimits = USUAL) -> Findings:
+def find_vignetting(
+    whites: Whites, name: str = "cam1", *, black: Estimate, otherwise: Sequence[Whites] = (), limits: WhiteLimits = USUAL
+) -> Findings:
     """Find the vignetting of a camera and of the projector, and the room's light, from a board's white in several poses.
 
     Parameters
@@ -160,6 +175,9 @@ def find_vignetting(whites: Whites, name: str = "cam1", *, black: Estimate, limi
         Of the camera.
     black : Estimate
         DN of a pixel without light, as of dark frames.
+    otherwise : sequence of Whites
+        The same patches as optics place them that are one standard deviation off, along each axis of their covariance: see
+        `placed` and `calibrated_optics.one_sigma_off`. Of a quiet sensor these errors are several times those by noise.
 
     Of the room, `room.over_projector` is its irradiance over that which the projector, all on, casts on a surface that faces
     it on its axis a metre away: times its flux in W/m^2 there, and 542 lm/W, that is `room_lux`.
@@ -184,7 +202,10 @@ def find_vignetting(whites: Whites, name: str = "cam1", *, black: Estimate, limi
         np.log(whites.level), whites.sigma / whites.level, whites.pose, partial(_predict, whites, limits.roughness),
         start, units, held, free=len(UNKNOWNS) - 2, outlier=limits.outlier,
     )  # fmt: skip
-    sigma, used = np.sqrt(np.diag(fit.covariance)), whites[fit.kept]
+    expected = _predict(whites, limits.roughness, fit.values)[0]
+    by_optics = [fit.gain @ (_predict(other, limits.roughness, fit.values)[0] - expected) for other in otherwise]
+    variance = np.diag(fit.covariance) + np.square(by_optics).sum(axis=0) if by_optics else np.diag(fit.covariance)
+    sigma, used = np.sqrt(variance), whites[fit.kept]
     gloss = float(np.max(np.abs(_sheens(used, limits.roughness) @ fit.values[len(UNKNOWNS) :][:sheens])))
     source = f"{len(used.level)} patches of white in {poses} poses, sheen of up to {100 * gloss:.1f} %"
     estimates, unknown = {}, lux

@@ -377,14 +377,17 @@ def _lenses(captured: BoardCapture, optics: Result, settings: Settings, rig: Rig
                         image, captured.board, *lit, points=optics.adjustment.points, pose=number, full=full
                     )
                 )
+    numbers = [captured.poses.index(name) for name in optics.observations.poses]
+    off = [(devices, dict(zip(numbers, poses, strict=True))) for devices, poses in calibrated_optics.one_sigma_off(optics)]
     for camera, parts in rims.items():
         length = getattr(rig, camera).lens.focal_length_mm
         nominal = Estimate(length, 0.0, "the calibrated focal length, and the pixels' size")
         found |= lenses.find_lens(lenses.joined(parts), camera, focal_length=nominal)
         if whites[camera]:
-            light = vignetting.find_vignetting(
-                vignetting.joined(whites[camera]), camera, black=_black(camera, captured, settings, rig, known)
-            )
+            white = vignetting.joined(whites[camera])
+            otherwise = [vignetting.placed(white, devices[camera], devices["projector"], poses) for devices, poses in off]
+            black = _black(camera, captured, settings, rig, known)
+            light = vignetting.find_vignetting(white, camera, black=black, otherwise=otherwise)
             found |= replace(light, estimates=light.estimates | _agreed(found.estimates, light.estimates))
     return found
 
