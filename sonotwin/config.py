@@ -419,8 +419,10 @@ def _is_usual_null(verb: str, override: str, others: Sequence[str]) -> bool:
 
 
 def _check_choice(verb: str, override: str) -> None:
-    """Refuse null, a list or a map in place of a group's choice, at which Hydra fails."""
+    """Refuse null, a list or a map in place of a group's choice, and null of another group, at which Hydra fails."""
     group, _, value = override.partition("=")
+    if value == "null" and group not in groups(verb) and (folder() / group).is_dir():
+        raise InputError(f"{verb}: {group}: {_unknown_key(group, defaults(verb))}")
     if (value == "null" or value[:1] in ("[", "{")) and (names := groups(verb).get(group)) is not None:
         expected = f"one of {', '.join(names)}"
         raise InputError(f"{verb}: {group}: expected {expected}, found {short(value)}; leave it out for the usual one")

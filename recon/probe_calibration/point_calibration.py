@@ -358,6 +358,13 @@ def of_crossings(crossings: Sequence[Crossing], poses: Array) -> Sightings:
     return Sightings(poses, pixels, pixel_covariance=covariance, directions=lines)
 
 
+def joined(some: Sequence[Sightings]) -> Sightings:
+    """Several sightings as one; what one of them lacks, all do."""
+    values = {field.name: [getattr(one, field.name) for one in some] for field in fields(Sightings)}
+    whole = {name: None if any(one is None for one in each) else np.concatenate(each) for name, each in values.items()}
+    return Sightings(**whole)
+
+
 def closed_form(poses: Array, pixels: Array) -> tuple[Array, Array, Array]:
     """Least squares without iteration, all frames alike, for any number of sets of frames at once.
 

@@ -48,7 +48,6 @@ from twin.optics.light_transport import Tracing
 from twin.optics.surface_session import Shooting
 from twin.ultrasound.transducer import Transducer
 
-FIVE = 5  # calibrations of which CR1 is usually told
 TOLD = 0.02  # relative change of the error by that of a number: less isn't told
 NUMBERS = (
     *(f"cam1.lens.{name}" for name in ("f_number", "focus_mm", "blur_px", "vignetting")),
@@ -65,10 +64,10 @@ class Change(Part):
     price: NotNegative = 0.0
 
 
-def _two_or_none(sessions: int) -> int:
-    if sessions == 1:
-        raise ValueError("expected 0 or at least 2, which show how sessions differ, found 1")
-    return sessions
+def _two_or_none(count: int) -> int:
+    if count == 1:
+        raise ValueError("expected 0 or at least 2, which show how they differ, found 1")
+    return count
 
 
 class Config(Part):
@@ -83,7 +82,7 @@ class Config(Part):
     poses: BoardPoses = BoardPoses()
     ultrasound: Transducer = Transducer()
     sessions: Annotated[int, Field(ge=0, le=10_000), AfterValidator(_two_or_none)] = 0
-    rehearsals: Annotated[int, Field(ge=0, le=100)] = 0
+    rehearsals: Annotated[int, Field(ge=0, le=100), AfterValidator(_two_or_none)] = 0
     white_dn: Positive = 65.0
     changes: dict[str, Change] = Field(default_factory=dict)
 
@@ -127,22 +126,22 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
 def _sessions(config: Config, session: Settings) -> Iterator[str]:
     """Lines of rehearsed and of drawn sessions."""
     if config.rehearsals:
-        rehearsed = rehearsal.rehearse(session, config.rehearsals, seed=0)
+        rehearsed = rehearsal.rehearse(session, config.rehearsals, config.rehearsals, seed=0)
         session = session.model_copy(update={"noise": rehearsal.noise_of(session, rehearsed.wires)})
-        yield from _rehearsed(rehearsed, config.rig.probe.image_size)
+        yield from _rehearsed(rehearsed)
     if config.sessions:
         for figure, one in predicted_session.predict(session, range(config.sessions)).items():
             of = f"of {config.sessions} drawn sessions, {one.worst:.2g} mm in the worst"
             yield f"predicted   {predicted_session.FIGURES[figure]} {one.rms:.3f} ± {1.96 * one.sigma:.2g} mm RMS (95 %) {of}"
 
 
-def _rehearsed(found: Rehearsed, size: tuple[int, int]) -> Iterator[str]:
+def _rehearsed(found: Rehearsed) -> Iterator[str]:
     """Lines: CR1 and its scatter, the noise of detectors, the errors of masses."""
-    seen, scatter = found.wires.seen, rehearsal.scatter_of_cr1(found.wires, FIVE, size)
+    seen, cr1 = found.wires.seen, found.repeatability
     of = f"of {rehearsal.IMAGES} B-scans each; {100 * seen.shown:.0f} % of poses show the crossing"
-    yield f"predicted   CR1 {rehearsal.expected_cr1(found.wires, size):.3f} mm, mean of five points, {of}"
+    yield f"predicted   CR1 {cr1.mm:.3f} ± {1.96 * cr1.known * cr1.mm:.3f} mm (95 %), mean of five points, {of}"
     noise = f"circles {seen.circle_px:.3f} px, crossings {seen.crossing_px:.2f} px"
-    yield f"by          {noise}; CR1 of {FIVE} calibrations scatters by {100 * scatter:.0f} %"
+    yield f"by          {noise}; CR1 of {rehearsal.FEW} calibrations scatters by {100 * cr1.of_few:.0f} %"
     there, (centre_mm, volume) = np.isfinite(found.masses.volume), found.masses
     errors = "none found"
     if there.any():

@@ -269,6 +269,13 @@ def test_null_is_accepted_where_it_is_the_usual_choice(tmp_path):
         config.load("scan", ["rig=wide", "rig=null"], model)
 
 
+def test_null_of_a_group_that_a_verb_has_not_is_an_unknown_key(tmp_path):
+    """As any other value of it is; Hydra ends in a traceback there."""
+    (tmp_path / "scan.yaml").write_text("out: x\n")
+    with pytest.raises(InputError, match=r"^scan: rig: unknown key; expected .*out"):
+        config.load("scan", ["rig=null"], create_model("Scan", out=(str, "x")))
+
+
 def test_a_choice_of_ones_own_is_found_whatever_the_temporary_folders_name(tmp_path_factory, monkeypatch):
     place = tmp_path_factory.mktemp("a, b's [c]")
     (place / "mine.yaml").write_text("gamma: 1.5\n")

@@ -6,13 +6,11 @@ import numpy as np
 
 from recon.identification import rig_file
 from recon.identification.estimates import Estimate, Findings
-from recon.model.calibration import Uncertainty
-from recon.model.probe import NAMES, ProbeCalibration
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
 from twin.experiments import predicted_session, rehearsal
 from twin.experiments.predicted_session import SessionError
-from twin.experiments.rehearsal import MassErrors, Rehearsed, Seen, Wires
+from twin.experiments.rehearsal import MassErrors, Rehearsed, Repeatability, Seen
 
 CHANGES = "{rig.cam1.sensor.saturation_e: {to: 15400, price: 100}, patterns.parts.1.steps: {to: 16}}"
 
@@ -56,18 +54,20 @@ def test_sessions_tell_errors_of_points_b_scans_and_masses(capsys):
 
 
 def test_rehearsals_tell_cr1_and_masses_and_lend_sessions_their_noise(monkeypatch, capsys):
-    """CR1 of shifts by 0.1 mm along each axis is 0.226 mm; one of two masses is found, 0.5 mm off and a tenth too small."""
-    covariance = np.diag(np.where(np.arange(len(NAMES)) < 5, 1e-16, 0.1**2))
-    probe = SimpleNamespace(calibration=ProbeCalibration(np.eye(4), np.array([0.12, 0.12]), Uncertainty(NAMES, covariance)))
-    wires = Wires((SimpleNamespace(adjustment=probe),) * 2, Seen(0.031, 1.24, 0.6, 0.9))
+    """One of two masses is found, 0.5 mm off and a tenth too small."""
+    wires = SimpleNamespace(seen=Seen(0.031, 1.24, 0.6, 0.9))
     masses = MassErrors(np.array([[0.3, 0.4, 0.0], [np.nan] * 3]), np.array([-0.1, np.nan]))
     drawn, figure = [], SessionError(0.2, 0.01, 0.3)
-    monkeypatch.setattr(rehearsal, "rehearse", lambda settings, count, seed: Rehearsed(wires, masses))
+    monkeypatch.setattr(
+        rehearsal,
+        "rehearse",
+        lambda settings, calibrations, sweeps, seed: Rehearsed(wires, Repeatability(0.224, 0.15, 0.1), 0.1, masses),
+    )
     monkeypatch.setattr(predicted_session, "predict", lambda settings, seeds: drawn.append(settings) or {"mass_error_mm": figure})
     assert main(["predict", "rehearsals=2", "sessions=2", "white_dn=30"]) == 0
     said = capsys.readouterr().out
-    assert "predicted   CR1 0.22" in said and "12 B-scans each; 60 % of poses show the crossing" in said
-    assert "circles 0.031 px, crossings 1.24 px; CR1 of 5 calibrations scatters by" in said
+    assert "predicted   CR1 0.224 ± 0.044 mm (95 %)" in said and "12 B-scans each; 60 % of poses show the crossing" in said
+    assert "circles 0.031 px, crossings 1.24 px; CR1 of 5 calibrations scatters by 15 %" in said
     assert "centre 0.500 mm, volume 10 % RMS, 1 of 2 found" in said
     (session,) = drawn
     assert (session.noise.circle_px, session.noise.crossing_px, session.film.white_dn) == (0.031, 1.24, 30)
@@ -79,6 +79,7 @@ def test_what_can_not_be_changed_is_refused_by_name(capsys):
         ("changes={rig.projector.gamma: {to: -1}}", "rig.projector.gamma"),
         ("changes={rig.projector.gamma: {price: 1}}", "to"),
         ("sessions=1", "sessions: expected 0 or at least 2"),
+        ("rehearsals=1", "rehearsals: expected 0 or at least 2"),
         ("shooting.exposure_s=0.2", "bright places saturate"),
         ("plate.centre_mm=[3000,0,660]", "in view of camera 1 and the projector"),
     ):

@@ -2,11 +2,16 @@
 
 Frames and B-scans are those of the rig, and all that follows them is the real software. So the rehearsal has the noise of this
 rig's own sensors, lenses, light and beam, and loses the images that it would lose; no size of noise is taken over from another
-rig. Calibrations of few images scatter as much as their covariances say, which hardly scatter: two or three of them tell the
-repeatability of any number.
+rig.
+
+The repeatability CR1 of five calibrations of a dozen images scatters itself by 15 % and more, and their covariances don't tell
+it: these hold what may have moved, and here nothing did; nor do errors drawn at other poses, as much of an error belongs to its
+pose. So calibrations are mixed: the first frame of one of them, the second of another, and so on, each mixture calibrated by
+the real software.
 """
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,11 +28,13 @@ from recon.freehand import scans as freehand_scans
 from recon.geometry import rigid
 from recon.geometry.order_statistics import NORMAL_MAD
 from recon.model.calibration import Calibration
-from recon.model.probe import NAMES, ProbeCalibration, place_slopes
+from recon.model.probe import ProbeCalibration
+from recon.model.rig import Probe
 from recon.model.tracks import Track
-from recon.probe_calibration import cross_wire, point_calibration, repeatability
+from recon.probe_calibration import cross_wire, point_calibration, repeatability, sound_in_water
 from recon.probe_calibration.cross_wire import Appearance
 from recon.probe_calibration.phantom_frames import PhantomFrames
+from recon.probe_calibration.point_calibration import Sightings
 from recon.probe_calibration.tank_calibration import Result
 from recon.probe_calibration.tank_calibration import Settings as Tank
 from recon.session import masses_step, probe_step
@@ -57,7 +64,8 @@ Image = NDArray[np.uint8]
 
 IMAGES = 12  # B-scans of a calibration: the first ones in which the crossing shows, of
 POSES = 60  # poses, which go on where those of the one before ended
-DRAWS = 500  # of calibrations, for the scatter of CR1
+MIXTURES = 60  # of calibrations, for CR1
+FEW, SETS = 5, 400  # calibrations that a laboratory compares, and sets of as many, for the scatter of their CR1
 REST_S = 0.2  # in each pose: two pairs of frames, between which the B-scan is taken
 AT_REST = Clocks(camera_hz=5.0)
 QUALITY = FilmQuality(
@@ -100,6 +108,15 @@ class Wires(NamedTuple):
 
     results: tuple[Result, ...]
     seen: Seen
+    sightings: tuple[Sightings, ...]  # of each
+
+
+class Repeatability(NamedTuple):
+    """CR1 of calibrations, mean of five points."""
+
+    mm: float
+    of_few: float  # relative standard deviation of the CR1 of FEW calibrations
+    known: float  # relative standard deviation of the first, at most, as so few calibrations were rehearsed
 
 
 class MassErrors(NamedTuple):
@@ -113,6 +130,8 @@ class Rehearsed(NamedTuple):
     """What a rig finds of itself."""
 
     wires: Wires
+    repeatability: Repeatability
+    place_mm: float  # RMS error of the place of the image's middle against the target, by one calibration
     masses: MassErrors  # by their segmentation alone
 
 
@@ -136,6 +155,7 @@ def calibrate(stage: Stage, count: int) -> Wires:
     """
     tank = Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0, appearance=Appearance(stage.dynamic_range_db))
     found, circles, crossings, counts = list[Result](), list[Array](), list[Array](), list[tuple[int, int, int]]()
+    sightings = list[Sightings]()
     for number in range(count):
         planned, images, looked_at = showing(wires(stage, number), tank.appearance)
         with TemporaryDirectory() as folder:
@@ -143,12 +163,13 @@ def calibrate(stage: Stage, count: int) -> Wires:
             frames = probe_step.look(recorded(planned, images, track, Path(folder)), tank, AT_REST.lag_s)
         result = probe_step.calibrate(frames, stage.settings.rig.probe, tank).result
         found.append(result)
+        sightings.append(frames.sightings)
         circles.append(errors)
         crossings.append(crossing_errors(planned, frames)[~result.adjustment.outliers])
         counts.append((looked_at, len(images), len(frames.usable)))
     poses, shown, usable = np.sum(counts, axis=0)
     circle_px, crossing_px = (of_one_axis(np.concatenate(errors)) for errors in (circles, crossings))
-    return Wires(tuple(found), Seen(circle_px, crossing_px, float(shown / poses), float(usable / shown)))
+    return Wires(tuple(found), Seen(circle_px, crossing_px, float(shown / poses), float(usable / shown)), tuple(sightings))
 
 
 def showing(planned: PlannedSweep, look: Appearance) -> tuple[PlannedSweep, list[Image], int]:
@@ -254,8 +275,8 @@ def crossing_errors(planned: PlannedSweep, frames: PhantomFrames) -> Array:
     return frames.sightings.pixels - (places[:, :2] / scale)[frames.usable]
 
 
-def rehearse(settings: Settings, count: int, seed: int) -> Rehearsed:
-    """What a rig finds in so many calibrations of its probe, and sweeps over masses.
+def rehearse(settings: Settings, calibrations: int, sweeps: int, seed: int) -> Rehearsed:
+    """What a rig finds in two calibrations of its probe or more, and sweeps over masses.
 
     Raises
     ------
@@ -263,7 +284,10 @@ def rehearse(settings: Settings, count: int, seed: int) -> Rehearsed:
         As `calibrate` does.
     """
     stage = of_itself(settings, seed)
-    return Rehearsed(calibrate(stage, count), joined([segmented_exactly(stage, number) for number in range(count)]))
+    found, probe = calibrate(stage, calibrations), settings.rig.probe
+    mixed = mixtures(found.sightings, probe)
+    of_wires = found, repeatability_of(mixed, found, probe.image_size), place_error(stage, mixed)
+    return Rehearsed(*of_wires, joined([segmented_exactly(stage, number) for number in range(sweeps)]))
 
 
 def noise_of(settings: Settings, found: Wires) -> Noise:
@@ -273,30 +297,49 @@ def noise_of(settings: Settings, found: Wires) -> Noise:
     return usual.model_copy(update={"circle_px": seen.circle_px, "crossing_px": seen.crossing_px, "wires": wires})
 
 
-def scatter_of_cr1(found: Wires, count: int, size: tuple[int, int]) -> float:
-    """Relative standard deviation of the CR1 of so few calibrations, of all their pairs, by the covariances of found ones."""
-    points, rng = repeatability.five_points(size), np.random.default_rng(0)
-    calibrations = [one.adjustment.calibration for one in found.results]
-    drawn = np.zeros((DRAWS, count, len(points), 3))
-    for one in calibrations:
-        assert one.uncertainty is not None
-        steps = rng.multivariate_normal(np.zeros(len(NAMES)), one.uncertainty.ordered(NAMES), (DRAWS, count))
-        slopes = place_slopes(one.target_from_image, one.scale, points)
-        drawn += np.einsum("kij,dnj->dnki", slopes, steps) / np.sqrt(len(calibrations))
-    values = np.array([repeatability.between_pairs(each).mean() for each in drawn])
-    return float(values.std() / values.mean())
+def mixtures(found: Sequence[Sightings], design: Probe, seed: int = 0) -> list[ProbeCalibration]:
+    """Calibrations that have each frame from one of n calibrations at random; those that are refused are left out."""
+    rng, mixed, count = np.random.default_rng(seed), list[ProbeCalibration](), min(len(one.pixels) for one in found)
+    for _ in range(MIXTURES):
+        chosen = rng.integers(len(found), size=count)
+        some = point_calibration.joined([found[which].of([frame]) for frame, which in enumerate(chosen)])
+        with suppress(InputError):
+            adjusted = point_calibration.calibrate(some, design.image_size, expected=design.target_from_image.matrix())
+            mixed.append(adjusted.calibration)
+    return mixed
 
 
-def expected_cr1(found: Wires, size: tuple[int, int]) -> float:
-    """CR1, mm, mean of five points, that calibrations of this kind have by their covariances."""
-    points = repeatability.five_points(size)
-    covariances = np.stack([point_calibration.point_covariance(one.adjustment.calibration, points) for one in found.results])
-    return float(repeatability.expected_cr1(covariances).mean())
+def repeatability_of(mixed: Sequence[ProbeCalibration], found: Wires, size: tuple[int, int]) -> Repeatability:
+    """CR1 of mixtures of n calibrations, two of which share a frame by a chance of 1 / n, by which they are alike.
+
+    Variances of differences are so (1 - 1 / n) of those of calibrations by frames of their own. Mixtures tell CR1 as well as the
+    n calibrations themselves do, or better.
+
+    Raises
+    ------
+    InputError
+        If most mixtures are refused.
+    """
+    if len(mixed) < MIXTURES // 2:
+        raise InputError(f"rehearsals: expected mixtures of calibrations that succeed, found {len(mixed)} of {MIXTURES} that do")
+    rng, count = np.random.default_rng(0), len(found.sightings)
+    few = [cr1([mixed[k] for k in rng.permutation(len(mixed))[:FEW]], size) for _ in range(SETS)]
+    of_few = float(np.std(few) / np.mean(few))
+    return Repeatability(
+        cr1(mixed, size) / float(np.sqrt(1 - 1 / count)), of_few, of_few * float(np.sqrt((FEW - 1) / (count - 1)))
+    )
 
 
-def cr1(found: Wires, size: tuple[int, int]) -> float:
-    """CR1, mm, mean of five points, of calibrations as they are."""
-    calibrations = [one.adjustment.calibration for one in found.results]
+def place_error(stage: Stage, mixed: Sequence[ProbeCalibration]) -> float:
+    """RMS error, mm, of the place of the image's middle in water against the target, by calibrations."""
+    rig, scanner = stage.settings.rig, sweep_session.calibration_of(stage.settings.rig, stage.settings.ultrasound)
+    truth = sound_in_water.in_medium(scanner, scanner.speed_m_s, float(sound_in_water.speed_of_sound(WATER_C)))
+    middle = repeatability.five_points(rig.probe.image_size)[:1]
+    return float(np.sqrt(np.mean([((one.to_target(middle) - truth.to_target(middle)) ** 2).sum() for one in mixed])))
+
+
+def cr1(calibrations: Sequence[ProbeCalibration], size: tuple[int, int]) -> float:
+    """CR1, mm, mean of five points."""
     return float(repeatability.cr1(calibrations, repeatability.five_points(size)).mean())
 
 
@@ -306,17 +349,20 @@ def masses(stage: Stage, number: int) -> PlannedSweep:
     return plan_sweep(_sweep(stage, f"masses{number}", scene, stage.settings.ultrasound, STROKE, SWEPT))
 
 
-def mass_errors(stage: Stage, planned: PlannedSweep, track: Track, probe: ProbeCalibration) -> MassErrors:
-    """Segment a sweep, told the usual speed of sound in the tissue, and compare."""
+def mass_errors(stage: Stage, planned: PlannedSweep, track: Track, probes: Sequence[ProbeCalibration]) -> MassErrors:
+    """Segment a sweep by each of some calibrations, told the usual speed of sound in the tissue, and compare."""
+    found = list[MassErrors]()
     with TemporaryDirectory() as folder:
         sweep = recorded(planned, (scan.image for scan in planned.scans()), track, Path(folder))
-        scans = freehand_scans.in_memory(freehand_scans.of_sweep(sweep, probe, SWEPT.lag_s, TISSUE_M_S))
-    found = masses_step.find(scans, Method(dynamic_range_db=stage.dynamic_range_db, overlays=0)).meshes
-    pairs = sweep_errors.compare(list(found.values()), [thing for thing in planned.scene.things if thing.inside])
-    none = np.full(3, np.nan)
-    centres = [none if one.found is None else one.found.center_mass - one.true.center_mass for one in pairs]
-    volumes = [np.nan if one.found is None else one.found.volume / one.true.volume - 1 for one in pairs]
-    return MassErrors(np.array(centres), np.array(volumes))
+        for probe in probes:
+            scans = freehand_scans.in_memory(freehand_scans.of_sweep(sweep, probe, SWEPT.lag_s, TISSUE_M_S))
+            meshes = masses_step.find(scans, Method(dynamic_range_db=stage.dynamic_range_db, overlays=0)).meshes
+            pairs = sweep_errors.compare(list(meshes.values()), [thing for thing in planned.scene.things if thing.inside])
+            none = np.full(3, np.nan)
+            centres = [none if one.found is None else one.found.center_mass - one.true.center_mass for one in pairs]
+            volumes = [np.nan if one.found is None else one.found.volume / one.true.volume - 1 for one in pairs]
+            found.append(MassErrors(np.array(centres), np.array(volumes)))
+    return joined(found)
 
 
 def segmented_exactly(stage: Stage, number: int) -> MassErrors:
@@ -324,10 +370,10 @@ def segmented_exactly(stage: Stage, number: int) -> MassErrors:
     planned = masses(stage, number)
     target = planned.plan.target
     probe = sweep_session.calibration_of(stage.settings.rig, stage.settings.ultrasound)
-    return mass_errors(stage, planned, Track(target.times, target.poses()), probe)
+    return mass_errors(stage, planned, Track(target.times, target.poses()), [probe])
 
 
-def segmented(stage: Stage, number: int, probe: ProbeCalibration) -> MassErrors:
-    """Errors of masses in a sweep that is filmed and tracked, by a calibration of the probe."""
+def segmented(stage: Stage, number: int, probes: Sequence[ProbeCalibration]) -> MassErrors:
+    """Errors of masses in a sweep that is filmed and tracked, by each of some calibrations of the probe."""
     planned = masses(stage, number)
-    return mass_errors(stage, planned, tracked(stage, planned)[0], probe)
+    return mass_errors(stage, planned, tracked(stage, planned)[0], probes)

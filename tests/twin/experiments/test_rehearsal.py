@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from recon.errors import InputError
 from recon.geometry import rigid
-from recon.model.calibration import Uncertainty
-from recon.model.probe import NAMES, ProbeCalibration
-from recon.probe_calibration import sound_in_water
+from recon.probe_calibration import repeatability, sound_in_water
 from recon.probe_calibration.cross_wire import Appearance
+from recon.probe_calibration.point_calibration import Sightings
 from scenes.acoustics import TISSUES, WATER_C
 from sonotwin.config import defaults
 from sonotwin.experiment_settings import settings_of
@@ -25,17 +25,9 @@ from twin.ultrasound.probe_path import crossing
 from twin.ultrasound.sweep_session import calibration_of
 from twin.working_range import working_range
 
-SIZE = (321, 408)
-HELD = rigid.from_rotation_vector(np.array([0.3, -1.2, 0.4]), np.array([20.0, -15.0, 60.0]))
-SHIFT_MM = 0.1  # standard deviation along each axis
+Array = NDArray[np.float64]
+SIGMA_RAD, SIGMA_MM, SIGMA_PX = 3e-4, 0.02, 1.0
 SEEN = Seen(circle_px=0.03, crossing_px=1.2, shown=0.6, tracked=0.8)
-
-
-def shifting(count: int = 1, times: float = 1.0) -> Wires:
-    """Calibrations that err by a shift alone, alike along all axes."""
-    covariance = np.diag(np.where(np.arange(len(NAMES)) < 5, 1e-16, (times * SHIFT_MM) ** 2))
-    one = ProbeCalibration(HELD, np.array([0.12, 0.12]), Uncertainty(NAMES, covariance))
-    return Wires((SimpleNamespace(adjustment=SimpleNamespace(calibration=one)),) * count, SEEN)
 
 
 @pytest.fixture(scope="module")
@@ -43,21 +35,64 @@ def settings() -> Settings:
     return Settings.model_validate(settings_of(defaults("study")))
 
 
-def test_cr1_is_that_of_distances_of_shifts():
-    """The distance of two places with normal errors along three axes is sqrt(2) sigma sqrt(8 / pi) in the mean."""
-    expected = np.sqrt(2) * SHIFT_MM * np.sqrt(8 / np.pi)
-    assert rehearsal.expected_cr1(shifting(), SIZE) == pytest.approx(expected, rel=0.02)
-    mixed = Wires(shifting(1, 0.0).results + shifting(1, np.sqrt(2)).results, SEEN)
-    assert rehearsal.expected_cr1(mixed, SIZE) == pytest.approx(expected, rel=0.02), "variances are averaged"
+def shown(settings: Settings, number: int) -> tuple[Array, Array, Array]:
+    """Poses : (12, 4, 4) world_from_target, and pixels : (12, 2) of the crossing, with the scale of depths in water."""
+    planned = rehearsal.wires(rehearsal.of_itself(settings, 3), number)
+    poses = planned.plan.truth.poses[: rehearsal.IMAGES]
+    local = np.stack([rigid.apply(rigid.invert(pose), crossing(planned.scanned)) for pose in poses])
+    scale = np.array(settings.rig.probe.scale_mm_per_px)
+    return poses @ np.linalg.inv(settings.rig.probe.target_from_image.matrix()), local[:, :2] / scale, scale
 
 
-@pytest.mark.parametrize("count", [2, 5, 12])
-def test_the_scatter_of_cr1_is_that_of_drawn_sets(count, rng):
-    """Of 4000 sets of shifts; of two, that of one distance: sqrt(3 pi / 8 - 1) = 0.42."""
-    places = rng.standard_normal((4000, count, 3))
-    first, second = np.triu_indices(count, 1)
-    drawn = np.linalg.norm(places[:, first] - places[:, second], axis=-1).mean(axis=1)
-    assert rehearsal.scatter_of_cr1(shifting(3), count, SIZE) == pytest.approx(drawn.std() / drawn.mean(), rel=0.12)
+def propagated(settings: Settings, poses: Array, pixels: Array, scale: Array, points: Array) -> Array:
+    """Covariances : (k, 3, 3) of places of points by least squares, by slopes of the equation, which are differences."""
+    held = settings.rig.probe.target_from_image.matrix()
+
+    def place(x: Array, at: Array) -> Array:
+        return rigid.apply(rigid.moved(held, x[2:8]), np.pad(at * (scale + x[:2]), [(0, 0), (0, 1)]))
+
+    def residuals(x: Array) -> Array:
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], place(x, pixels)) + poses[:, :3, 3] - x[8:]
+
+    steps = np.diag([1e-6] * 2 + [1e-5] * 3 + [1e-3] * 6)
+    slopes = np.stack([(residuals(h) - residuals(-h)) / (2 * h.sum()) for h in steps], axis=-1)
+    turns = poses[:, :3, :3] @ held[:3, :3]
+    by_turn = np.stack([rigid.cross(poses[k, :3, :3] @ arm) for k, arm in enumerate(place(np.zeros(11), pixels))])
+    noise = turns @ np.diag([*(SIGMA_PX * scale) ** 2, settings.wire_path.miss_mm**2]) @ np.swapaxes(turns, 1, 2)
+    noise += SIGMA_MM**2 * np.eye(3) + SIGMA_RAD**2 * by_turn @ np.swapaxes(by_turn, 1, 2)
+    known = np.linalg.inv(np.einsum("nij,nik,nkl->jl", slopes, np.linalg.inv(noise), slopes))[:8, :8]
+    of_points = np.stack([(place(h, points) - place(-h, points)) / (2 * h.sum()) for h in steps[:8]], axis=-1)
+    return of_points @ known @ np.swapaxes(of_points, 1, 2)
+
+
+def test_cr1_of_mixtures_is_that_of_least_squares_however_few_are_mixed(settings, rng, monkeypatch):
+    """Of eight calibrations with 96 frames, and of these two by two, in the mean of four: both are known to 5 %."""
+    monkeypatch.setattr(rehearsal, "MIXTURES", 30)
+    size, of_pose = settings.rig.probe.image_size, np.array([SIGMA_RAD] * 3 + [SIGMA_MM] * 3)
+    sightings, covariances = [], []
+    for number in range(8):
+        poses, pixels, scale = shown(settings, number)
+        covariances.append(propagated(settings, poses, pixels, scale, repeatability.five_points(size)))
+        steps, errors = rng.standard_normal((len(poses), 6)) * of_pose, SIGMA_PX * rng.standard_normal(pixels.shape)
+        sightings.append(
+            Sightings(
+                np.stack([rigid.moved(*each) for each in zip(poses, steps, strict=True)]),
+                pixels + errors,
+                np.tile(np.diag(of_pose**2), (len(poses), 1, 1)),
+                np.tile(SIGMA_PX**2 * np.eye(2), (len(poses), 1, 1)),
+            )
+        )
+
+    def cr1(some: list[Sightings]) -> rehearsal.Repeatability:
+        wires = Wires((), SEEN, tuple(some))
+        return rehearsal.repeatability_of(rehearsal.mixtures(some, settings.rig.probe), wires, size)
+
+    expected = repeatability.expected_cr1(np.array(covariances)).mean()
+    found = cr1(sightings)
+    assert found.mm == pytest.approx(expected, rel=0.15)
+    assert 0.08 < found.of_few < 0.3 and found.known == pytest.approx(found.of_few * np.sqrt(4 / 7))
+    by_two = [cr1(sightings[first : first + 2]).mm for first in range(0, 8, 2)]
+    assert np.mean(by_two) == pytest.approx(expected, rel=0.2)
 
 
 def test_noise_is_told_along_an_axis_whatever_a_few_fingers_cover(rng):
@@ -68,11 +103,11 @@ def test_noise_is_told_along_an_axis_whatever_a_few_fingers_cover(rng):
 
 def test_sessions_are_drawn_with_the_noise_of_the_rehearsal(settings):
     """Circles and crossings as seen, as many B-scans as are usable; the board's noise is still that of the rig's own images."""
-    found = rehearsal.noise_of(settings, Wires((), SEEN))
+    found = rehearsal.noise_of(settings, Wires((), SEEN, ()))
     assert (found.circle_px, found.crossing_px, found.wires) == (0.03, 1.2, round(0.8 * rehearsal.IMAGES))
     assert found.board_px == settings.noise.at(working_range(settings.rig)).board_px
     assert found.at(replace(working_range(settings.rig), noise=3.0)) == found, "it isn't scaled again"
-    assert rehearsal.noise_of(settings, Wires((), SEEN._replace(tracked=0.1))).wires == 6
+    assert rehearsal.noise_of(settings, Wires((), SEEN._replace(tracked=0.1), ())).wires == 6
 
 
 def test_crossings_err_from_where_they_are_in_the_image(settings):

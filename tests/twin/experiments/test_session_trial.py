@@ -30,11 +30,11 @@ def test_the_prediction_is_of_the_identified_rig_alone(monkeypatch):
     scanner = SimpleNamespace(dynamic_range_db=55.0)
     identified = SimpleNamespace(rig=named("identified"), scanner=SimpleNamespace(description={}))
     rehearsed, filmed = [], []
-    wires = Wires((SimpleNamespace(calibration="probe"),) * session_trial.CALIBRATIONS, Seen(0.1, 1.0, 0.5, 0.9))
+    wires = Wires((SimpleNamespace(calibration="probe"),) * session_trial.CALIBRATIONS, Seen(0.1, 1.0, 0.5, 0.9), ())
 
-    def rehearse(settings, count, seed):
+    def rehearse(settings, calibrations, sweeps, seed):
         rehearsed.append((settings.rig.name, settings.ultrasound, seed))
-        return Rehearsed(wires, ERRORS)
+        return Rehearsed(wires, (), 0.0, ERRORS)
 
     def calibrate(stage, count):
         filmed.append((stage.settings.rig.name, stage.settings.ultrasound, stage.known, stage.dynamic_range_db, stage.seed))
@@ -47,13 +47,13 @@ def test_the_prediction_is_of_the_identified_rig_alone(monkeypatch):
     monkeypatch.setattr(rehearsal, "noise_of", lambda settings, found: rehearsed.append(settings.rig.name) or settings.noise)
     monkeypatch.setattr(session_trial, "repeatabilities", lambda *_: {})
     monkeypatch.setattr(predicted_session, "predict", lambda settings, seeds: {"mass_error_mm": SimpleNamespace(rms=0.0)})
-    settings = _Settings(poses=SimpleNamespace(seed=1), noise=_Settings(drawn=_Settings(latency=1.0)))
+    settings = _Settings(poses=SimpleNamespace(seed=1), noise=_Settings(drawn=_Settings()))
     figures = session_trial.compare(settings, named("true"), "true scanner", identified, 7)
     assert rehearsed == [("identified", scanner, 7), "identified"]
     seed = 7 + session_trial.OTHER_SEED
     assert filmed == [
         ("true", "true scanner", "optics of identified", 55.0, seed),
-        *["optics of identified"] * session_trial.SWEEPS,
+        *["optics of identified"] * 2,
     ]
     assert figures["centre_mm_predicted_over_found"] == 1
 
