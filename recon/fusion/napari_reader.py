@@ -90,7 +90,10 @@ def surface_layer(name: str, mesh: trimesh.Trimesh, colour: str) -> Layer:
 
 
 def centres_layer(masses: dict[str, FoundMass]) -> Layer:
-    """Masses' centres, as balls that hold the true ones with 95 % along each axis, and their figures as features."""
+    """Masses' centres, as balls that hold the true ones with 95 % or more, and their figures as features.
+
+    A ball's radius is 1.96 times the root of the covariance's trace: 95 % if all errors are along one line, more else.
+    """
     centres = np.array([mass.mesh.center_mass for mass in masses.values()])[:, ::-1]
     size = [2 * NINETY_FIVE * float(mass.figures.get("centre_sigma_mm") or 0.0) for mass in masses.values()]
     names = sorted(set.intersection(*(set(mass.figures) for mass in masses.values())))

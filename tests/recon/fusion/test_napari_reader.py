@@ -61,7 +61,7 @@ def test_all_results_are_layers_in_the_world(result):
 
 
 def test_centres_are_as_large_as_they_are_uncertain(result):
-    """95 % along each axis; figures that all masses have are features."""
+    """By 1.96 sigma as radius; figures that all masses have are features."""
     centres, told, _ = layers(result)["centres, 95 %"]
     assert centres == pytest.approx(np.array([[30, 20, 10], [60, -5, 0]]), abs=1e-5)
     assert told["size"] == pytest.approx([2 * 1.96 * 0.2, napari_reader.LEAST_MM])
