@@ -34,9 +34,6 @@ def sweep(config: "Config", console: Console) -> bool:
     for figure in of.counts:
         counted = finite(one.figures.get(figure) for one in done)
         console.print(f"count       {figure} {counted.sum():g} in {counted.size} trials", markup=False)
-    for figure in of.shares:
-        held = finite(one.figures.get(figure) for one in done)
-        console.print(f"share       {figure} {study_page.share(held)} of {held.size} trials", markup=False)
     for figure, limit in of.limits.items():
         sign = "± " if (finite(one.figures.get(figure) for one in done) < 0).any() else ""  # an error, beside a size
         beside = f", {of.limit} {sign}{_range(done, limit)}" if limit else ""

@@ -22,7 +22,7 @@ from recon.errors import InputError
 from recon.files.code_digest import code_digest, is_unchanged
 from recon.files.metrics import Metrics
 from recon.model.patterns import Patterns
-from recon.model.rig import NotNegative, Part, Positive, Rig
+from recon.model.rig import Part, Positive, Rig
 from scenes.board_poses import Config as BoardPoses
 from scenes.kinds.board import Config as Board
 from twin.conditions import IDEAL, Conditions
@@ -52,7 +52,6 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "training": "twin.experiments.training_trial",
     "acceptance": "twin.experiments.acceptance_audit",
     "session": "twin.experiments.session_trial",
-    "biopsy": "twin.experiments.biopsy_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
@@ -89,16 +88,6 @@ class AcceptedRig(Part):
     fault: Fault = "none"  # noise, a scale or a bend make errors of twice the limit
 
 
-class Biopsy(Part):
-    """A patient and a hand, of a needle that is led to a mass."""
-
-    tissue: Literal["fatty", "mixed", "dense"] = "mixed"  # a breast, which is swept by the speed of sound of a mixed one
-    hand: Literal["exact", "trained", "novice"] = "trained"  # that leads the needle by the display
-    segmented_mm: NotNegative = (
-        0.1  # standard deviation along each axis of a mass's middle by segmentation alone; of rendered sweeps
-    )
-
-
 class Settings(Part):
     """All that experiments are made from; as in `conf/study.yaml`."""
 
@@ -119,7 +108,6 @@ class Settings(Part):
     masses: MassCondition = MassCondition()
     seen: SeenTissue = SeenTissue()
     acceptance: AcceptedRig = AcceptedRig()
-    biopsy: Biopsy = Biopsy()
     ranges: DataRanges
 
     @model_validator(mode="after")
@@ -143,7 +131,6 @@ class Experiment:
     limits: Mapping[str, str]  # figures that are plotted, and the figure that each is held against, or ""
     limit: str = "closed form"  # what these are
     counts: tuple[str, ...] = ()  # figures that a study adds up over its trials
-    shares: tuple[str, ...] = ()  # figures that are 0 or 1, of which it tells the share of 1
     predict: Callable[[Settings, int], Metrics] | None = None  # some of the figures by formulas, in milliseconds
     packages: tuple[str, ...] = ()  # by whose code its figures are made, beside PACKAGES
     libraries: tuple[str, ...] = ()  # distributions of others, beside LIBRARIES

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from scipy import stats
 
 from recon.files import atomic
 from recon.files.metrics import shown
@@ -73,9 +71,9 @@ def plots(folder: Path, done: Sequence[Done], of: Experiment, names: Mapping[str
 
 
 def points(done: Sequence[Done], of: Experiment, names: Mapping[str, Name] = NO_NAMES) -> Section:
-    """A table of all points: sums of counts, shares with their intervals, and medians of other figures."""
+    """A table of all points: sums of counts, and medians of other figures."""
     table, fields = study_runs.rows(done), list(done[0].trial.point)
-    titles = [_name(names, figure).title for figure in (*of.counts, *of.shares)]
+    titles = [_name(names, figure).title for figure in of.counts]
     for figure, limit in of.limits.items():
         table, shown_as = study_plots.comparable(table, figure, limit, _name(names, figure))
         titles.append(shown_as)
@@ -83,8 +81,6 @@ def points(done: Sequence[Done], of: Experiment, names: Mapping[str, Name] = NO_
     caption = f"Medians over seeds; in brackets: {of.limit}."
     if of.counts:
         caption = f"Sums over seeds of {words(of.counts[0])} to {words(of.counts[-1])}. Medians over seeds of all else."
-    if of.shares:
-        caption += " Shares with their 95 % intervals."
     return Section("All points", [page.table(head, _points(table, fields, of), caption)])
 
 
@@ -114,21 +110,12 @@ def kept_drawing(folder: Path, name: str, drawn: Figure, caption: str, detail: s
 
 
 def _points(table: study_plots.Table, fields: Sequence[str], of: Experiment) -> Iterator[list[str]]:
-    """A row a point of the design: its values, its trials, sums of counts, shares, and medians of figures beside closed forms."""
+    """A row a point of the design: its values, its trials, sums of counts, and medians of figures beside their closed forms."""
     for point in _distinct_points(table, fields)[:MOST_ROWS]:
         alike = [row for row in table if tuple(row[field] for field in fields) == point]
         sums = [shown(float(study_runs.finite(row.get(figure) for row in alike).sum()), ".6g") for figure in of.counts]
-        sums += [share(study_runs.finite(row.get(figure) for row in alike)) for figure in of.shares]
         cells = [_median(alike, figure) + (f" ({_median(alike, limit)})" if limit else "") for figure, limit in of.limits.items()]
         yield [*(short(value) for value in point), str(len(alike)), *sums, *cells]
-
-
-def share(values: NDArray[np.float64]) -> str:
-    """The share of trials that have a 1, not a 0, with its 95 % interval [Wilson 1927]."""
-    if not values.size:
-        return "-"
-    interval = stats.binomtest(int(values.sum()), values.size).proportion_ci(0.95, "wilson")
-    return f"{100 * values.mean():.0f} % ({100 * interval.low:.0f} to {100 * interval.high:.0f})"
 
 
 def _median(rows: study_plots.Table, figure: str) -> str:

@@ -123,19 +123,6 @@ def test_counts_are_added_up_over_seeds(tmp_path):
     assert "Sums over seeds of masses missed to masses false. Medians over seeds of all else." in text(page)
 
 
-def test_shares_have_their_intervals(tmp_path):
-    """By Wilson's closed form, of 3 in 4, and of none in 4."""
-    of = Experiment((), lambda settings, seed: {}, {}, shares=("near", "far"))
-    trials = [done({"light": "dim"}, {"near": float(seed > 0), "far": 0.0}, seed) for seed in range(4)]
-    page = written(tmp_path, trials, [study_page.points(trials, of, study_page.NO_NAMES)])
-    z2, n = 1.959964**2, 4
-    middle, half = (0.75 + z2 / 2 / n) / (1 + z2 / n), np.sqrt(z2 * (0.75 * 0.25 / n + z2 / 4 / n**2)) / (1 + z2 / n)
-    near = f"75 % ({100 * (middle - half):.0f} to {100 * (middle + half):.0f})"
-    found = [cell.replace("\xa0", " ") for cell in rows_of(page)[-1]]
-    assert found == ["dim", "4", near, f"0 % (0 to {100 * z2 / (n + z2):.0f})"]
-    assert "Shares with their 95 % intervals." in text(page)
-
-
 def test_points_without_figures_are_named(tmp_path):
     trials = [*DONE, done({"rig.pitch": 40, "light": "dim"}, "coverage: found none", 7)]
     page = text(written(tmp_path, trials, [study_page.points(trials, OF, study_page.NO_NAMES)]))
