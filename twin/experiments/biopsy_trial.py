@@ -66,8 +66,9 @@ LATENCY_S = 0.1  # from a frame to the screen and the hand; assumed
 PUSHED_MM = 0.5  # standard deviation of a mass's way before the needle, in scattered tissue; assumed
 SHIFT_MM = 0.5  # along each axis, by which she has moved since the scan, and isn't tracked; assumed
 SOFTER = {"fatty": 1.4, "scattered": 1.0, "heterogeneous": 0.85, "dense": 0.7}  # tissue, which yields by that much more; assumed
-STROKE = SurfacePath(start_mm=(-22.0, -24.0), end_mm=(-22.0, 24.0), speed_mm_s=15.0, standoff_mm=-2.0)
+STROKE = SurfacePath(start_mm=(-14.0, -24.0), end_mm=(-14.0, 24.0), speed_mm_s=15.0, standoff_mm=-2.0)
 CLOCKS = Clocks(scanner_hz=15.0, camera_hz=7.5)
+HIGH_MM = 42.0  # of the skin there over the chest, to a millimetre in four patients
 MASS = {"size_mm": 14.0, "form": "oval", "pattern": "hypoechoic"}  # under the stroke
 ARM = ("rig", "training", "tissue")  # fields that patients of one arm share
 
@@ -203,7 +204,7 @@ def rendered_place(settings: Settings, number: int, key: list[int]) -> Planned:
 def patient(tissue: str, number: int, key: list[int]) -> dict:
     """A patient with a mass under the stroke, as deep as the drawn ones."""
     aside = np.random.default_rng([*key, 71]).uniform(-3.0, 3.0, 2)
-    mass = MASS | {"centre_mm": (float(STROKE.start_mm[0] + aside[0]), float(aside[1]), 48.0 - DEEP_MM)}
+    mass = MASS | {"centre_mm": (float(STROKE.start_mm[0] + aside[0]), float(aside[1]), HIGH_MM - DEEP_MM)}
     return {"kind": "patient", "seed": number, "edge_mm": 1.5, "anatomy": {"density": tissue}, "masses": [mass]}
 
 

@@ -1,4 +1,4 @@
-"""Cores of a virtual trial: closed forms of their distances, signs of errors that cancel, and hands as their sources have them."""
+"""Cores of a virtual trial: closed forms of their distances, errors that cancel, and hands as their sources have them."""
 
 from dataclasses import replace
 
