@@ -55,8 +55,10 @@ SHARE = 0.1  # standard deviation of the share of gland on a beam's way, about t
 SCAN_MM = 0.57  # along each axis: of masses in patients of study `patients`, pressed and breathing, the median error is 1.0 mm,
 # of which 0.5 mm are the speed that it is told
 LIVING = patient_trial.LIVING
-DEFLECTION_MM = 0.55  # across the shaft, along each axis: 1.77 mm in the median of 18 G, as force grows with the square and
-# stiffness with the fourth power of the diameter, at 14 G (2.1 over 1.27 mm); assumed of the scaling
+DEFLECTION_MM = (
+    0.55  # across the shaft, along each axis, of 14 G: 1.77 mm in the median of prostate biopsies, if these are of 18 G,
+)
+# force grows with the square of the diameter (2.1 over 1.27 mm) and stiffness with its fourth power; all three assumed
 DEEP_MM = chain_trial.DEEP_MM
 # from the target's middle to the tip; slope and bearing beside x, by which both cameras see the target; assumed
 SHAFT_MM, RISE_DEG, ASIDE_DEG = 100.0, (40.0, 55.0), 25.0
