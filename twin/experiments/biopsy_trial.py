@@ -63,7 +63,7 @@ DEEP_MM = chain_trial.DEEP_MM
 # from the target's middle to the tip; slope and bearing beside x, by which both cameras see the target; assumed
 SHAFT_MM, RISE_DEG, ASIDE_DEG = 100.0, (40.0, 55.0), 25.0
 PIVOTS, PIVOT_DEG = 25, 25.0  # frames in which the tip is calibrated, and their tilts about each axis
-LOOSE = 3.0  # a worn rig's bracket over a usual one; assumed
+WORN = 3.0  # drift and bracket of a worn rig over usual ones; assumed: ten times the drift, the target isn't tracked any more
 LATENCY_S = 0.1  # from a frame to the screen and the hand; assumed
 PUSHED_MM = 0.5  # standard deviation of a mass's way before the needle, in scattered tissue; assumed
 SHIFT_MM = 0.5  # along each axis, by which she has moved since the scan, and isn't tracked; assumed
@@ -127,7 +127,7 @@ def rig_of(settings: Settings) -> Settings:
     """The settings of a rig of some quality.
 
     An identified one is calibrated in the same session by a board of known length; what the data sheet has is used as it is
-    delivered, under the conditions that are set; a worn one has drifted ten times as much, its prints have warped to twice the
+    delivered, under the conditions that are set; a worn one has drifted thrice as much, its prints have warped to twice the
     error, its bracket is loose and its lenses are dull. All these factors are assumed.
     """
     life, noise = settings.conditions, settings.noise
@@ -137,8 +137,8 @@ def rig_of(settings: Settings) -> Settings:
         drift = drift.model_copy(update={"centre_px": 0.0, "focal": 0.0})
         print_ = print_.model_copy(update={"place_mm": print_.place_mm / 5})
     elif settings.biopsy.rig == "worn":
-        drift = drift.model_copy(update={"centre_px": 10 * drift.centre_px, "focal": 10 * drift.focal})
-        loose = {"bracket_mm": LOOSE * motion.bracket_mm, "bracket_deg": LOOSE * motion.bracket_deg}
+        drift = drift.model_copy(update={"centre_px": WORN * drift.centre_px, "focal": WORN * drift.focal})
+        loose = {"bracket_mm": WORN * motion.bracket_mm, "bracket_deg": WORN * motion.bracket_deg}
         motion = motion.model_copy(update=loose)
         print_ = print_.model_copy(update={"place_mm": 2 * print_.place_mm})
         noise = noise.model_copy(update={"circle_px": 2 * noise.circle_px})
