@@ -17,6 +17,7 @@ from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
 from twin.studies.rig_search import Goal
+from twin.studies.shares import Shares
 from twin.studies.study_runs import Trial
 
 SWEEP = "sweep"  # the study that conf/study doesn't have: all of it is given
@@ -39,6 +40,7 @@ class Study(Part):
     points: Points | None = None
     search: Goal | None = None
     budget: Budget | None = None
+    shares: Shares | None = None
     beside: tuple[Figure, ...] = ()  # figures of the paper
     fields: tuple[str, ...] = ()  # of conf/study.yaml, as on the command line
 

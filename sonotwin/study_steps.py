@@ -12,7 +12,18 @@ from recon.reports import page
 from recon.reports.page import Section
 from sonotwin import study_plan
 from twin.experiments import document_tables, experiment_runs
-from twin.studies import beside_paper, budget_page, error_budget, factors, rig_search, search_page, study_page, study_runs
+from twin.studies import (
+    beside_paper,
+    budget_page,
+    error_budget,
+    factors,
+    rig_search,
+    search_page,
+    shares,
+    shares_page,
+    study_page,
+    study_runs,
+)
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Point
 from twin.studies.rig_search import Candidate, Goal
@@ -40,6 +51,11 @@ def sweep(config: "Config", console: Console) -> bool:
         console.print(f"figure      {figure} {_range(done, figure)}{beside}", markup=False)
     names = beside_paper.names(config.beside)
     sections = [*study_page.plots(config.out, done, of, names), study_page.points(done, of, names)]
+    if config.shares is not None:
+        for field, level, found in shares.by_level(config.shares, done):
+            texts = (f"{text} {shares_page.in_words(found[name])} %" for name, text in config.shares.counts.items())
+            console.print(f"share       {f'{field}={level}' if field else 'all'}: {', '.join(texts)}", markup=False)
+        sections = [*shares_page.sections(config.out, config.shares, done), *sections]
     if config.beside:
         sections = [_beside_paper(config, done, console), *sections]
     write(config, done, sections, console)

@@ -28,6 +28,7 @@ from twin.studies.beside_paper import Figure
 from twin.studies.error_budget import Budget
 from twin.studies.factors import Filling
 from twin.studies.rig_search import Goal
+from twin.studies.shares import Shares
 from twin.working_range import working_range
 
 
@@ -46,6 +47,7 @@ class Config(Part):
     fill: Filling = "sobol"
     search: Goal | None = None
     budget: Budget | None = None
+    shares: Shares | None = None
     beside: tuple[Figure, ...] = ()
     document: Path | None = None
     engine: Engine = Engine()
@@ -64,7 +66,7 @@ class Config(Part):
             given = compose("study", [*study.fields, *overrides])
         own = {} if study is None else study.model_dump(exclude={"fields"})
         fields = {name: value for name, value in given.items() if name not in Settings.model_fields and value is not None}
-        for name in ("search", "budget"):
+        for name in ("search", "budget", "shares"):
             if own.get(name) and isinstance(fields.get(name), dict):
                 fields[name] = own[name] | fields[name]
         for name in ("of", "over"):

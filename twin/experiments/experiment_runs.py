@@ -23,6 +23,7 @@ from recon.files.code_digest import code_digest, is_unchanged
 from recon.files.metrics import Metrics
 from recon.model.patterns import Patterns
 from recon.model.rig import Part, Positive, Rig
+from scenes.anatomy import Density
 from scenes.board_poses import Config as BoardPoses
 from scenes.kinds.board import Config as Board
 from twin.conditions import IDEAL, Conditions
@@ -52,6 +53,7 @@ MODULES = {  # where an experiment's EXPERIMENT is
     "training": "twin.experiments.training_trial",
     "acceptance": "twin.experiments.acceptance_audit",
     "session": "twin.experiments.session_trial",
+    "biopsy": "twin.experiments.biopsy_trial",
 }
 DIGITS = 6  # significant, of figures
 PACKAGES = ("recon", "scenes", "twin")  # by whose code figures are made
@@ -88,6 +90,17 @@ class AcceptedRig(Part):
     fault: Fault = "none"  # noise, a scale or a bend make errors of twice the limit
 
 
+class Biopsy(Part):
+    """A patient of a virtual trial."""
+
+    rig: Literal["identified", "data_sheet", "worn"] = "data_sheet"  # how well it is known
+    training: Literal["novice", "trained"] = "trained"  # of the hand that leads the needle
+    tissue: Density = "scattered"
+    measured: Literal["drawn", "rendered"] = (
+        "drawn"  # how the planned place is found: by drawn detections, or from rendered images
+    )
+
+
 class Settings(Part):
     """All that experiments are made from; as in `conf/study.yaml`."""
 
@@ -108,6 +121,7 @@ class Settings(Part):
     masses: MassCondition = MassCondition()
     seen: SeenTissue = SeenTissue()
     acceptance: AcceptedRig = AcceptedRig()
+    biopsy: Biopsy = Biopsy()
     ranges: DataRanges
 
     @model_validator(mode="after")
