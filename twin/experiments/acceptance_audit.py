@@ -115,7 +115,7 @@ def audit(known: Calibration, limits: Limits, fault: Fault, seed: int, draws: in
         """Mean of the spheres fitted to a ball over much noise.
 
         It isn't the exact points' fit: least squares of distances from a sphere that is seen in a cap, with noise along the line
-        of sight, shrink the radius by some 15 sigma^2 / radius. Noise and its negative leave of the scatter even orders alone.
+        of sight, shrink the radius by some 14 sigma^2 / radius. Noise and its negative leave of the scatter even orders alone.
         """
         exact = bent(seen.points[::SHARED])
         step = noise_px / SIGMA_PX * (bent(seen.points[::SHARED] + SIGMA_PX * seen.slopes[::SHARED]) - exact)
