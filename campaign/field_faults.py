@@ -21,7 +21,13 @@ FREE = {"over"}  # fields whose values are other fields and theirs
 FOREIGN, FILE, LOOP = "foreign", "there.txt", "loop"
 OUT = ("/dev/null", "/dev/null/below", "/proc/below", FILE, f"{FILE}/below", LOOP, "x" * 300)
 TAKEN = ("", FOREIGN)  # of folders with files of others, which verbs that replace the whole folder refuse
-BESIDE = ("render", "sweep", "film", "accuracy")  # verbs that write folders or files of their own into a folder
+BESIDE = (
+    "render",
+    "render-artefacts",
+    "sweep",
+    "film",
+    "accuracy",
+)  # verbs that write folders or files of their own into a folder
 IN = ("", "nowhere", "/dev/zero", FILE, FOREIGN, LOOP, "x" * 300, "x" * 5000, "caf\udce9")
 
 

@@ -141,6 +141,8 @@ COMMANDS = (
              "phantom/capture/calibration/probe.yaml")),
     Command("certify", ("capture=balls", "artefacts.bar=null", "artefacts.plane=null", "limits.pf_mm=1", "limits.pf95_mm=1"),
             ("balls",), tuple(f"balls/sphere/00/{name.removeprefix('ball/')}" for name in BALL)),
+    Command("certify", ("capture=tool", "artefacts=divots.yaml", "tip=small_tip.yaml"), ("tool", "divots.yaml", "small_tip.yaml"),
+            ("tool/divots/01.csv", "divots.yaml", "small_tip.yaml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),
@@ -224,6 +226,7 @@ COMMANDS = (
     Command("import", ("layout=markerpose", "folder=markerpose"), ("markerpose",),
             ("markerpose/images/L/3.png", "markerpose/StereoParams.xml")),
     Command("render", ("scene=sphere", "tracing.samples=2")),
+    Command("render-artefacts", ("artefacts=upright.yaml", "tracing.samples=2"), ("upright.yaml",), ("upright.yaml",)),
     Command("sweep", STROKE),
     Command("film", ("frames=1",)),
     Command("dataset", ("samples=1",)),
@@ -360,13 +363,19 @@ def _write_small_ones(folder: Path) -> None:
 
 
 def _write_tool(folder: Path) -> None:
-    """Poses of a needle that pivots in a dimple, the needle's mesh, and a tip's file."""
+    """Poses of a needle that pivots in a dimple, and in two divots, its mesh, a tip's file, and certificates of artefacts."""
     import trimesh
 
     rng, length = np.random.default_rng(0), 150.0
     needle = pivot_films.Tool(np.array([0.0, 0.0, -length]), np.array([0.0, 0.0, -1.0]))
     poses = pivot_films.poses_of(pivot_films.turns(needle, rng), needle.tip)
     sweep_tables.write_track(folder / "pivot.csv", pivot_films.tracked(poses, rng))
+    (folder / "tool/divots").mkdir(parents=True, exist_ok=True)
+    for k, aside_mm in enumerate((0.0, 80.0)):
+        moved = rigid.transform(np.eye(3), (aside_mm, 0, 0)) @ poses
+        sweep_tables.write_track(folder / f"tool/divots/{k:02d}.csv", pivot_films.tracked(moved, rng))
+    (folder / "divots.yaml").write_text("divots: {places_mm: [[0, 0, 0], [80, 0, 0]], expanded_mm: 0.02}\n", encoding="utf-8")
+    (folder / "upright.yaml").write_text("plane: {size_mm: [180, 60], form_mm: 0.002}\n", encoding="utf-8")
     mesh = trimesh.creation.cone(1.0, length, sections=6).apply_transform(np.diag([1.0, -1, -1, 1]))
     for suffix in (".stl", ".glb"):
         mesh.export(folder / f"needle{suffix}")

@@ -53,6 +53,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
 }
 WRITTEN = ("out", "document", "log", "record")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
+    "certificate.md": {"outputs/tool"},  # by the two before it
     "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture"},
     "training.md": {"shipped"},  # the word for networks that come with sonotwin
     "captures.md": {

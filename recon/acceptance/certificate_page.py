@@ -30,6 +30,9 @@ READING = (
     "number of points, PF faster than PF95: compare tests of as many points. PS is the fitted diameter, of free radius and "
     "all points, less the certified one; SD the distance of the fitted centres, and E the length over both balls, by that "
     "and the fitted radii, each less the certified one.",
+    "TP is the distance of a tracked tool’s tip from its mean in a divot, root mean square, with the tool at rest or turned; "
+    "TD the distance of the tip’s means in two divots less the certified one: tests of ASTM F2554 in kind. An error of the "
+    "tip’s calibration counts as the tool’s.",
     "The guidelines are sold, not public. Quantities, numbers of places and sizes of artefacts are as publicly described; "
     "the exact arrangements, and what ISO 10360-13 has beside them (registered views, lengths between points, rules for "
     "repeats), are not reproduced. E is ours: a view from one side does not see a bar’s outer ends.",
@@ -144,6 +147,9 @@ def artefact_rows(artefacts: Artefacts) -> list[tuple[str, str, str]]:
         rows += [(name, f"{one.mm:.4f} mm", _certified(one.expanded_mm, one.k)) for name, one in named]
     if plane is not None:
         rows += [("plane, form", f"{plane.form_mm:.4f} mm", "")]
+    if artefacts.divots is not None:
+        expanded = _certified(artefacts.divots.expanded_mm, artefacts.divots.k)
+        rows += [("divots, distance of two", f"{len(artefacts.divots.places_mm)} places", expanded)]
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from recon.model.part import Finite, NotNegative, Part, Positive, Vector
@@ -68,6 +69,22 @@ class PlateCertificate(Part):
     """mm, certified deviation from a plane, peak to valley"""
 
 
+class DivotCertificate(Material):
+    """A plate with divots, in which the tip of a tracked tool stands."""
+
+    places_mm: Annotated[tuple[Vector, ...], Field(min_length=2)]
+    """mm, the tip in each divot, in a frame of the plate; divots are numbered from 0"""
+    expanded_mm: NotNegative
+    """mm, expanded uncertainty U of a distance of two of them"""
+    k: Annotated[float, Field(ge=1, le=4)] = 2.0
+    """coverage factor of U"""
+
+    def distance(self, first: int, second: int) -> Certified:
+        """Distance of two divots."""
+        apart = np.linalg.norm(np.subtract(self.places_mm[second], self.places_mm[first]))
+        return Certified(mm=float(apart), expanded_mm=self.expanded_mm, k=self.k)
+
+
 class Volume(Part):
     """The measuring volume, a box along the world's axes, that the rig is specified for."""
 
@@ -97,6 +114,8 @@ class Artefacts(Part):
     """null: no tests of lengths"""
     plane: PlateCertificate | None = None
     """null: no test of flatness"""
+    divots: DivotCertificate | None = None
+    """null: no tests of a tracked tool"""
 
     @model_validator(mode="after")
     def _can_be(self) -> "Artefacts":
@@ -105,6 +124,14 @@ class Artefacts(Part):
             raise ValueError(f"bar.length.mm: expected more than its balls' diameters, found {bar.length.mm:g}")
         if bar is not None and bar.rod_mm >= min(ball.mm for ball in bar.diameters):
             raise ValueError(f"bar.rod_mm: expected less than its balls' diameters, found {bar.rod_mm:g}")
-        if self.sphere is None and bar is None and self.plane is None:
-            raise ValueError("expected sphere, bar or plane, found none of them")
+        if self.divots is not None:
+            places = np.array(self.divots.places_mm)
+            apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + np.diag(np.full(len(places), np.inf))
+            if not apart.min() > 0:
+                first, second = np.unravel_index(apart.argmin(), apart.shape)
+                raise ValueError(
+                    f"divots.places_mm: expected places apart from each other, found {first} and {second} in one place"
+                )
+        if self.sphere is None and bar is None and self.plane is None and self.divots is None:
+            raise ValueError("expected sphere, bar, plane or divots, found none of them")
         return self

@@ -25,6 +25,10 @@ class Limits(Part):
     """F, flatness measurement error: distance of two planes around all points of a plane, less the worst 3 in 1000"""
     f95_mm: Positive | None = 0.25
     """the same around 95 % of the points"""
+    tp_mm: Positive | None = None
+    """TP, repeatability of a tracked tool's tip in a divot: distance from its mean, RMS"""
+    td_mm: Positive | None = None
+    """TD, error of the distance of two divots by a tracked tool"""
 
 
 def decide(value_mm: float, expanded_mm: float, limit_mm: float) -> Decision:

@@ -1,12 +1,14 @@
-"""The optical tests: from points of artefacts in their places to test values with budgets, decisions and a verdict.
+"""The tests: from points of artefacts, and of a tool's tip, in their places to test values with budgets, decisions and a verdict.
 
 The measurand of a test value is the rig's error of indication in that place: what another measurement there would show in the
 mean. So the noise of this one counts as uncertainty (type A), which ISO 14253-5 would leave out, where the error of this one
 measurement is meant; its share stands in each budget. Errors of the rig's calibration are what is tested, and no uncertainty.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import combinations
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from recon.acceptance.conformity import Decision, Limits, decide, together
 from recon.acceptance.form_probing import REPEATS, Probed, probe_plane, probe_sphere
 from recon.acceptance.gum_budget import DRAWS, Budget, Input
 from recon.acceptance.prescribed_places import Demand
+from recon.acceptance.tool_probing import Seated, probe_divot
 from recon.geometry.primitives import Plane, Sphere
 
 Array = NDArray[np.float64]
@@ -41,15 +44,18 @@ CHARACTERISTICS = {
     "E": Characteristic("length measurement error, over both balls", "", "e_mm"),
     "F": Characteristic("flatness measurement error, all points but 3 in 1000", "", "f_mm"),
     "F95": Characteristic("flatness measurement error, 95 % of the points", "P[Form.Pla.D95%]", "f95_mm"),
+    "TP": Characteristic("repeatability of a tool’s tip in a divot, RMS", "", "tp_mm"),
+    "TD": Characteristic("error of divots’ distance by a tool’s tip", "", "td_mm"),
 }
 
 
 class Measured(NamedTuple):
-    """Points of the artefacts : (n, 3) mm, by the names of their places."""
+    """Points of the artefacts, and a tip's places : (n, 3) mm, by the names of their places."""
 
     spheres: Mapping[str, Array]
     bars: Mapping[str, tuple[Array, Array]]
     planes: Mapping[str, Array]
+    divots: Mapping[str, Array] = MappingProxyType({})  # see `divot_number`
 
 
 @dataclass(frozen=True)
@@ -139,10 +145,49 @@ def judge(
         found = probe_plane(points, rng, repeats)
         forms(("F", "F95"), place, found, artefacts.plane.form_mm)
         middles.setdefault("plane", []).append(points.mean(axis=0))
+    _judge_tool(measured.divots, artefacts, add)
     order = {test: number for number, test in enumerate(CHARACTERISTICS)}
     values.sort(key=lambda one: order[one.symbol])
     placed = {kind: np.array(found) for kind, found in middles.items()}
     return Acceptance(tuple(values), tuple(prescribed_places.demands(artefacts, placed)), placed)
+
+
+def divot_number(place: str) -> tuple[int, bool]:
+    """Number of the divot that a place's name begins with, and whether it has nothing else: `divots/03`, `divots/03-roll`.
+
+    Raises
+    ------
+    ValueError
+        If it has none.
+    """
+    number, _, words = place.rpartition("/")[2].partition("-")
+    return int(number), not words
+
+
+def _judge_tool(divots: Mapping[str, Array], artefacts: Artefacts, add: Callable[..., None]) -> None:
+    """Repeatability in each divot, and distances of all pairs of those of which the tool stood as it does in use."""
+    seated = {place: probe_divot(places) for place, places in divots.items()}
+    for place, found in seated.items():
+        add("TP", place, found.frames, _scatter, [Input("distance from the mean, RMS", found.rms_mm, found.rms_sigma_mm, "A")])
+    for first, second in combinations([place for place in seated if divot_number(place)[1]], 2):
+        words = f"{first}-{second.rpartition('/')[2]}"
+        one, other = seated[first], seated[second]
+        add("TD", words, one.frames + other.frames, _distance, distance_inputs((first, second), (one, other), artefacts))
+
+
+def distance_inputs(names: tuple[str, str], seated: tuple[Seated, Seated], artefacts: Artefacts) -> list[Input]:
+    """Inputs of an error of the distance of two divots."""
+    assert artefacts.divots is not None
+    apart = seated[1].mean - seated[0].mean
+    length = float(np.linalg.norm(apart))
+    inputs = [
+        Input(f"tip in the {name} divot, towards the other", place, float(np.sqrt(apart @ one.covariance @ apart)) / length, "A",
+              freedom=one.freedom)
+        for name, place, one in zip(("first", "second"), (0.0, length), seated, strict=True)
+    ]  # fmt: skip
+    certified = artefacts.divots.distance(divot_number(names[0])[0], divot_number(names[1])[0])
+    material = [one for one in _material(artefacts.divots, artefacts) if one.name != "paint"]
+    return [*inputs, _certified("certified distance", certified), *material]
 
 
 def form_inputs(width_mm: float, sigma_mm: float, form_mm: float) -> list[Input]:
@@ -217,6 +262,15 @@ def _grown(x: Mapping[str, Array]) -> Array:
 
 def _form(x: Mapping[str, Array]) -> Array:
     return x["width of the shell"] + x["form of the artefact"]
+
+
+def _scatter(x: Mapping[str, Array]) -> Array:
+    return x["distance from the mean, RMS"]
+
+
+def _distance(x: Mapping[str, Array]) -> Array:
+    apart = x["tip in the second divot, towards the other"] - x["tip in the first divot, towards the other"]
+    return apart - x["certified distance"] * _grown(x) + x["mounting"]
 
 
 def _size(x: Mapping[str, Array]) -> Array:

@@ -154,8 +154,8 @@ def _caption(caption: str, detail: str) -> str:
 
 
 def _together(cell: str) -> str:
-    """A cell's text whose numbers stay beside their units on narrow pages."""
-    return re.sub(rf"(?<=\d) (?={UNITS})", "\u00a0", _text(cell))
+    """A cell's text whose numbers stay beside their units and uncertainties on narrow pages."""
+    return re.sub(rf"(?<=\d) (?={UNITS}|± ?\d)|(?<=\d ±) (?=\d)", "\u00a0", _text(cell))
 
 
 def _text(text: str) -> str:

@@ -1,4 +1,4 @@
-"""An acceptance test: captures of artefacts in their places, or meshes of these by any scanner, to a certificate."""
+"""An acceptance test: captures or meshes of artefacts in their places, and poses of a tool in divots, to a certificate."""
 
 import json
 import re
@@ -15,20 +15,23 @@ from recon.acceptance.artefact_points import Region
 from recon.acceptance.certificates import Artefacts
 from recon.acceptance.conformity import Limits
 from recon.acceptance.optical_acceptance import CHARACTERISTICS, Acceptance, Measured
-from recon.capture import surface_part
+from recon.capture import surface_part, sweep_tables, tip_files
 from recon.capture.manifest import MANIFEST
 from recon.errors import InputError
 from recon.files import atomic, meshes
+from recon.geometry import rigid
 from recon.model.part import NotNegative, Part
 from recon.registry import Choice
 from recon.session import skin_step
 from recon.session.watch import SILENT, Watch
+from recon.tracking import results
 
 Array = NDArray[np.float64]
 
 BY = "certify"  # who writes
 PAGE, SHEET, FILE = "certificate.html", "certificate.pdf", "certificate.json"
 MESHES = (".ply", ".stl", ".glb")
+LEAST_POSES = 10  # of a tool in a divot
 CAPTURE = "capture"  # within a place's folder, as `sonotwin render` writes it
 
 
@@ -36,13 +39,17 @@ class Settings(Part):
     """Sources, certificates and limits."""
 
     capture: Path
-    """folder with the folders sphere, bar and plane; each has a capture, or a mesh in mm (PLY, STL, GLB), a place: 00, 01, ..."""
+    """folder with the folders sphere, bar and plane; each has a capture, or a mesh in mm (PLY, STL, GLB), a place: 00, 01, ...;
+    and with the folder divots of a certified plate: poses of a tool in divot 00, 01, ..., a table as `sonotwin track` writes it,
+    or the folder that it wrote; 00-WORDS for another recording in divot 00, such as with the tool turned about one axis"""
     artefacts: Annotated[Artefacts, Choice("steel")]
     """certificates of the artefacts, and the volume: a name in conf/artefacts, or a YAML file"""
     limits: Annotated[Limits, Choice("meza2021")]
     """maximum permissible errors: a name in conf/limits, or a YAML file"""
     calibration: Path | None = None
     """calibration file, used instead of the captures' own"""
+    tip: Path | None = None
+    """tip.yaml of the tool in the divots, as `sonotwin calibrate-tip` writes it"""
     cap_deg: Annotated[float, Field(ge=20, le=85)] = 50.0
     """deg, half angle of the part of a ball that is taken, from the middle of what is seen: at its rim fringes thin out"""
     border_mm: NotNegative = 5.0
@@ -65,7 +72,7 @@ def run(settings: Settings, out: Path, watch: Watch = SILENT) -> Acceptance:
     InputError
         If a capture or mesh is missing or damaged, an artefact isn't in it, or `out` can't be written to.
     """
-    atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration))
+    atomic.check_folder(out, BY, inputs=(settings.capture, settings.calibration, settings.tip))
     places = places_of(settings.capture, settings.artefacts)
     measured = measure(settings, places, watch)
     found = optical_acceptance.judge(measured, settings.artefacts, settings.limits, settings.seed)
@@ -87,23 +94,30 @@ def places_of(folder: Path, artefacts: Artefacts) -> dict[str, dict[str, Path]]:
     found = {}
     for kind in artefact_points.expected(artefacts):
         own = sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else []
-        names = [one for one in own if not one.name.startswith(".") and (one.is_dir() or one.suffix.lower() in MESHES)]
+        kinds = MESHES if kind != "divots" else (".csv",)
+        names = [one for one in own if not one.name.startswith(".") and (one.is_dir() or one.suffix.lower() in kinds)]
         if not names:
-            expected = "a folder with a capture or mesh for each place, such as 00"
+            what = "a capture or mesh for each place" if kind != "divots" else "a table of poses for each divot"
+            expected = f"a folder with {what}, such as 00"
             raise InputError(f"{folder / kind}: expected {expected}, found none; artefacts.{kind}=null leaves it out")
         found[kind] = {f"{kind}/{re.sub(r'[.][^.]+$', '', one.name)}": one for one in names}
         if len(found[kind]) < len(names):
-            raise InputError(f"{folder / kind}: expected each place once, found a capture and a mesh, or two meshes, of one name")
+            two = "a capture and a mesh, or two meshes," if kind != "divots" else "a folder and a table"
+            raise InputError(f"{folder / kind}: expected each place once, found {two} of one name")
     return found
 
 
 def measure(settings: Settings, places: Mapping[str, Mapping[str, Path]], watch: Watch) -> Measured:
     """Points of the artefacts in all places."""
     region, rng = Region(cap_deg=settings.cap_deg, border_mm=settings.border_mm), np.random.default_rng(settings.seed)
-    found: dict[str, dict[str, Any]] = {"sphere": {}, "bar": {}, "plane": {}}
+    found: dict[str, dict[str, Any]] = {"sphere": {}, "bar": {}, "plane": {}, "divots": {}}
     total = sum(map(len, places.values()))
     for name, path in watch.follow([pair for own in places.values() for pair in own.items()], total, "measuring"):
-        points, artefacts = points_of(path, settings.calibration), settings.artefacts
+        artefacts = settings.artefacts
+        if name.startswith("divots") and artefacts.divots is not None:
+            found["divots"][name] = tips_of(path, settings.tip, name, len(artefacts.divots.places_mm))
+            continue
+        points = points_of(path, settings.calibration)
         if name.startswith("sphere") and artefacts.sphere is not None:
             found["sphere"][name] = artefact_points.ball(points, artefacts.sphere.diameter.mm, str(path), region)
         elif name.startswith("bar") and artefacts.bar is not None:
@@ -111,7 +125,27 @@ def measure(settings: Settings, places: Mapping[str, Mapping[str, Path]], watch:
         else:
             found["plane"][name] = artefact_points.plate(points, str(path), rng, region)
     watch.say(f"measured    {', '.join(f'{len(own)} of {kind}' for kind, own in found.items() if own)}")
-    return Measured(found["sphere"], found["bar"], found["plane"])
+    return Measured(found["sphere"], found["bar"], found["plane"], found["divots"])
+
+
+def tips_of(path: Path, tip: Path | None, name: str, divots: int) -> Array:
+    """Places : (n, 3) mm of a tool's tip in a divot, by its poses; InputError if there is no table of these, or no such divot."""
+    try:
+        number = optical_acceptance.divot_number(name)[0]
+    except ValueError:
+        number = -1
+    if not 0 <= number < divots:
+        raise InputError(f"{path}: expected a name that begins with a divot's number, 00 to {divots - 1:02d}, found {path.stem}")
+    if tip is None:
+        raise InputError(
+            "tip: expected the tip.yaml of the tool in the divots, found none; artefacts.divots=null leaves them out"
+        )
+    tip_mm = tip_files.read(tip).tip_mm
+    track = sweep_tables.read_track(path if path.is_file() else path / results.POSES)
+    poses = track.poses[track.found]
+    if len(poses) < LEAST_POSES:
+        raise InputError(f"{path}: expected {LEAST_POSES} poses or more of the tool in the divot, found {len(poses)}")
+    return np.array([rigid.apply(pose, tip_mm) for pose in poses])
 
 
 def points_of(path: Path, calibration: Path | None) -> Array:

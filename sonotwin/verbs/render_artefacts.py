@@ -3,10 +3,11 @@
 Ten spheres, seven ball bars and six planes over the volume of the certificates, each a capture with its ground truth:
 OUT/sphere/00/capture, OUT/bar/00/capture, OUT/plane/00/capture and so on. Sizes are drawn within the certificates, and the room's
 temperature within its limits, from the seed; the artefacts' form and paint are perfect. Nothing stands behind them. Takes about
-five seconds a place on two cores for the usual rig's megapixel; a place that is there already is rendered again.
+five seconds a place on two cores for the usual rig's megapixel; with few rays a pixel, such as two, the rims of balls are noisy.
+A place that is there already is rendered again.
 
     sonotwin render-artefacts out=outputs/acceptance
-    sonotwin render-artefacts conditions=lifelike tracing.samples=4 out=outputs/acceptance
+    sonotwin render-artefacts conditions=lifelike out=outputs/acceptance
 """
 
 from pathlib import Path

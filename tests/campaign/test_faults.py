@@ -76,7 +76,9 @@ def test_pngs_of_the_grammar_keep_their_checksums():
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: " ".join(command.line[:2]))
 def test_each_command_has_bad_fields(command, tmp_path, monkeypatch):
     """Twenty or more, none of which is the command itself."""
-    shutil.copy(config.folder() / "patterns" / "paper_surface.yaml", tmp_path / "patterns.yaml")
+    made_of = {"patterns": "patterns/paper_surface", "upright": "artefacts/steel", "divots": "artefacts/divot_plate"}
+    for name, choice in made_of.items():
+        shutil.copy(config.folder() / f"{choice}.yaml", tmp_path / f"{name}.yaml")
     monkeypatch.chdir(tmp_path)
     named = [field.partition("=")[0] for field in command.fields if field.split("=")[-1].split("/")[0] in command.folders]
     found = list(field_faults.overrides(command.verb, command.line[1:], named))

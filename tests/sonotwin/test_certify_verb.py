@@ -5,10 +5,15 @@ import json
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from recon.acceptance import prescribed_places
 from recon.acceptance.certificates import Volume
+from recon.capture import sweep_tables, tip_files
 from recon.files import meshes
+from recon.geometry import rigid
+from recon.model.tip import Tip
+from recon.model.tracks import Track
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
 from tests.recon.acceptance import drawn_surfaces
@@ -85,10 +90,10 @@ def test_without_limits_values_are_reported(scanned, tmp_path):
         (["artefacts.bar.rod_mm=40"], "artefacts.bar.rod_mm: expected less than its balls' diameters, found 40"),
         (
             ["artefacts.sphere=null", "artefacts.bar=null", "artefacts.plane=null"],
-            "artefacts: expected sphere, bar or plane, found none of them",
+            "artefacts: expected sphere, bar, plane or divots, found none of them",
         ),
         (["limits.sd_mm=-1"], "limits.sd_mm: expected"),
-        (["artefacts=glass"], "artefacts: expected one of steel"),
+        (["artefacts=glass"], "artefacts: expected one of divot_plate, steel"),
     ],
 )
 def test_mistakes_are_refused(scanned, tmp_path, capsys, fields, complaint):
@@ -117,3 +122,47 @@ def test_a_rendered_bar_is_certified(tmp_path, capsys):
     assert len(spacings) == 7
     assert all(abs(one["value_mm"]) < 0.01 for one in spacings), spacings
     assert "demand" not in capsys.readouterr().out
+
+
+PLATE = ["artefacts=divot_plate", "tip=TOOL/tip.yaml"]
+
+
+@pytest.fixture
+def tool(tmp_path):
+    """Poses of a tool that turns in three divots of the plate, drawn with 0.05 mm of noise, and its tip."""
+    rng, tip = np.random.default_rng(3), np.array([0.0, -120.0, -30.0])
+    for k, place in enumerate([(0, 0, 650), (80, 0, 650), (0, 60, 650)]):
+        turns = Rotation.from_euler("xyz", rng.uniform(-15, 15, (60, 3)), degrees=True).as_matrix()
+        origins = place - turns @ tip + 0.05 * rng.standard_normal((60, 3))
+        poses = np.array([rigid.transform(turn, origin) for turn, origin in zip(turns, origins, strict=True)])
+        (tmp_path / f"tool/divots/{k:02d}").mkdir(parents=True)
+        sweep_tables.write_track(tmp_path / f"tool/divots/{k:02d}/poses.csv", Track(np.arange(60) * 10**8, poses))
+    tip_files.write(tmp_path / "tool/tip.yaml", Tip(tip, 0.01 * np.eye(3)))
+    return tmp_path / "tool"
+
+
+def test_a_tracked_tool_is_certified(tool, tmp_path):
+    """In three divots, with three distances; noise of 0.05 mm along each axis is 0.087 RMS."""
+    assert certify(tool, tmp_path / "out", *[field.replace("TOOL", str(tool)) for field in PLATE], "limits.td_mm=0.15") == 0
+    values = json.loads((tmp_path / "out/certificate.json").read_text())["values"]
+    assert [one["quantity"] for one in values] == ["TP"] * 3 + ["TD"] * 3
+    assert all(one["value_mm"] == pytest.approx(0.087, rel=0.3) for one in values[:3])
+    assert all(abs(one["value_mm"]) < one["expanded_uncertainty_mm"] and one["decision"] == "accepted" for one in values[3:])
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        (["artefacts=divot_plate"], "tip: expected the tip.yaml of the tool in the divots, found none"),
+        (
+            [*PLATE, "artefacts.divots.places_mm=[[0,0,0],[80,0,0]]"],
+            "divots/02: expected a name that begins with a divot's number, 00 to 01",
+        ),
+        ([*PLATE, "artefacts.divots.places_mm=[[0,0,0],[0,0,0]]"], "expected places apart from each other, found 0 and 1"),
+        ([*PLATE, "capture=TOOL/divots"], "divots/divots: expected a folder with a table of poses for each divot"),
+    ],
+)
+def test_mistakes_about_a_tool_are_refused(tool, tmp_path, capsys, fields, complaint):
+    assert certify(tool, tmp_path / "out", *[field.replace("TOOL", str(tool)) for field in fields]) == 2
+    error = capsys.readouterr().err
+    assert complaint in error and error.count("\n") == 1 and not (tmp_path / "out").exists()

@@ -40,6 +40,7 @@ NOISY = 5.0
 TWICE = 2.0  # limits, of a bad rig's error
 PATCHES, SHARED = 500, 4  # of an artefact, and points of each, which share their noise
 REDRAWN = 50  # times that a shell's mean width is drawn
+MIRRORED = 4  # times that noise of a ball is drawn, and turned over, for its mean fit
 CAP = 0.6  # cosine to the line of sight, up to which a ball is seen
 ARTEFACTS = Artefacts(
     sphere=BallCertificate(diameter=Certified(mm=39.6, expanded_mm=0.002), form_mm=0.001),
@@ -110,13 +111,25 @@ def audit(known: Calibration, limits: Limits, fault: Fault, seed: int, draws: in
         residuals -= residuals @ basis @ basis.T
         return np.array([shell_width(residuals, share).mean() for share in (ALL, MOST)])
 
+    def mean_sphere(seen: Seen) -> Sphere:
+        """Mean of the spheres fitted to a ball over much noise.
+
+        It isn't the exact points' fit: least squares of distances from a sphere that is seen in a cap, with noise along the line
+        of sight, shrink the radius by some 14 sigma^2 / radius. Noise and its negative leave of the scatter even orders alone.
+        """
+        exact = bent(seen.points[::SHARED])
+        step = noise_px / SIGMA_PX * (bent(seen.points[::SHARED] + SIGMA_PX * seen.slopes[::SHARED]) - exact)
+        noise = rng.standard_normal((MIRRORED, len(exact), 1)) * step
+        fits = [fit_sphere(exact + one).shape for half in noise for one in (half, -half)]
+        return Sphere("", np.mean([one.centre for one in fits], axis=0), float(np.mean([one.radius for one in fits])))
+
     truths = dict[tuple[str, str], float]()
     spheres, bars, planes = dict[str, Array](), dict[str, tuple[Array, Array]](), dict[str, Array]()
     for k, centre in enumerate(prescribed_places.spheres(ARTEFACTS.volume, 2 * actual.radius_mm)):
         name, perfect = f"sphere/{k:02d}", _ball(rig, centre, actual.radius_mm, [seed, k])
         spheres[name] = measure(_ball(rig, centre, actual.radius_mm, [seed, k], ARTEFACTS.sphere.form_mm))
         exact = fit_sphere(bent(perfect.points)).shape
-        truths[name, "PS"] = 2 * (exact.radius - actual.radius_mm)
+        truths[name, "PS"] = 2 * (mean_sphere(perfect).radius - actual.radius_mm)
         outwards = (bent(perfect.points) - exact.centre) / exact.radius
         widths = mean_widths(perfect, exact, np.column_stack([outwards, np.ones(len(outwards))]))
         truths |= {(name, symbol): float(width) for symbol, width in zip(("PF", "PF95"), widths, strict=True)}
@@ -125,7 +138,7 @@ def audit(known: Calibration, limits: Limits, fault: Fault, seed: int, draws: in
         name, ends = f"bar/{k:02d}", (middle - along * actual.length_mm / 2, middle + along * actual.length_mm / 2)
         balls = [_ball(rig, end, actual.ball_radius_mm, [seed, k]) for end in ends]
         bars[name] = (measure(balls[0]), measure(balls[1]))
-        first, second = (fit_sphere(bent(one.points)).shape for one in balls)
+        first, second = (mean_sphere(one) for one in balls)
         truths[name, "SD"] = float(np.linalg.norm(second.centre - first.centre)) - actual.length_mm
         truths[name, "E"] = truths[name, "SD"] + first.radius + second.radius - 2 * actual.ball_radius_mm
     for k, (middle, tilt) in enumerate(zip(*prescribed_places.planes(ARTEFACTS.volume), strict=True)):

@@ -9,6 +9,8 @@ from recon.reports import page
     ("cell", "shown"),
     [
         ("0.160 mm", "0.160\u00a0mm"),
+        ("0.0581 ± 0.0090 mm", "0.0581\u00a0±\u00a00.0090\u00a0mm"),
+        ("−0.003 ± 0.010 mm", "−0.003\u00a0±\u00a00.010\u00a0mm"),
         ("466 mm³, −29 mm³", "466\u00a0mm³, −29\u00a0mm³"),
         ("48.6 to 51.3 ms (95 %)", "48.6 to 51.3\u00a0ms (95\u00a0%)"),
         ("107 of 107 frames", "107 of 107 frames"),
