@@ -118,12 +118,15 @@ def surface_figures(mesh: trimesh.Trimesh, expected: surface_errors.Truth) -> Me
     apart, number = nearest(surface_tree(points), places)
     off = ((places - points[number]) * normals[number]).sum(axis=1)
     of_it = apart < FALSE_MM
-    lit = np.float64(expected.points[::STEP, ::STEP][expected.lit[::STEP, ::STEP]])
-    back, _ = nearest(surface_tree(places), lit)
+    chosen = expected.lit[::STEP, ::STEP]
+    lit, outwards = (np.float64(of[::STEP, ::STEP][chosen]) for of in (expected.points, expected.normals))
+    back, number = nearest(surface_tree(places), lit)
+    met = back < FALSE_MM
+    along = np.abs(((places[number] - lit) * outwards).sum(axis=1))[met]  # not by how finely places lie on the surface
     return {
         "to_truth_rms_mm": surface_errors.rms(off[of_it]),
         "to_truth_median_mm": float(np.median(np.abs(off[of_it]))) if of_it.any() else np.nan,
-        "from_truth_median_mm": float(np.median(back)),
+        "from_truth_median_mm": float(np.median(along)) if met.any() else np.nan,
         "complete_share": float((back < NEAR_MM).mean()),
         "false_share": float(1 - of_it.mean()),
     }
