@@ -2,7 +2,6 @@
 
 import csv
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from recon.model.tracks import Track
 from sonotwin import benchmark_sessions
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
+from twin.engine import Engine, results
 from twin.evaluation import benchmark_results
 from twin.evaluation.surface_errors import Truth
 from twin.optics.surface_session import calibration_of
@@ -127,11 +127,19 @@ def test_another_round_is_kept(tmp_path):
 
 @pytest.mark.slow
 def test_workers_change_no_byte(tmp_path):
-    """Two sessions, of optics and of tracking: the same by one worker and by two, and no truth among them."""
+    """A session of tracking and one of a surface: the same by one worker and by two, and no truth among them."""
+    found = []
     for workers in (1, 2):
-        fields = [f"out={tmp_path / str(workers)}", "sessions=2", f"engine.workers={workers}", "seed=bytes"]
-        assert main(["render-benchmark", *fields]) == 0
-    one, two = ((tmp_path / name / "checksums.sha256").read_text(encoding="utf-8") for name in "12")
-    assert one == two and OPTICS in one and "optics.yaml" not in one.partition(TRACKING)[0]
-    assert (tmp_path / "1/benchmark.json").read_text() == (tmp_path / "2/benchmark.json").read_text()
-    assert Path(tmp_path / "1/truth" / TRACKING / "sweep/film.npz").is_file()
+        out = tmp_path / str(workers)
+        tasks = ((out, "bytes", number) for number in (1, 2))
+        assert len(list(results(Engine(workers=workers), benchmark_sessions.write, tasks))) == 2
+        found.append(
+            {
+                path.relative_to(out): path.read_bytes()
+                for path in out.rglob("*.*")
+                if path.is_file() and path.name != ".sonotwin.json"
+            }
+        )
+    assert found[0] == found[1]
+    assert (tmp_path / "1/truth" / TRACKING / "sweep/film.npz").is_file()
+    assert not list((tmp_path / "1/sessions").rglob("*.npz")) and not list((tmp_path / "1/sessions").rglob("settings.json"))
