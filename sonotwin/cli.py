@@ -40,6 +40,8 @@ VERBS = (  # in the order in which a person meets them
     Verb("render", "render a capture of a scene with its ground truth"),
     Verb("render-artefacts", "render the artefacts of an acceptance test in the prescribed places"),
     Verb("sweep", "render a freehand ultrasound sweep of a scene with its ground truth"),
+    Verb("render-benchmark", "render a round of the open benchmark: sessions, and apart from them their truth"),
+    Verb("score-benchmark", "score anybody's results of the open benchmark against the truth"),
     Verb("dataset", "render tracking frames with ground truth, as training data"),
     Verb("film", "render a film of the moving target with its ground truth"),
     Verb("print", "draw a calibration board or the probe's target for a printer, true to scale"),

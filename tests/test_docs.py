@@ -42,6 +42,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
     "identify": {"", "rig.yaml", "conditions.yaml", "ultrasound.yaml"},
     "compare-twin": {"", "report.html"},
     "render-artefacts": {""},
+    "render-benchmark": {"truth"},
     "calibrate-tip": {"tip.yaml"},
     "calibrate-probe": {"probe.yaml"},
     "freehand": {"sequence.igs.mha"},
@@ -54,7 +55,7 @@ MADE = {  # what a verb writes into its folder `out`, for those that read it; ""
 WRITTEN = ("out", "document", "log", "record")  # fields that name what is written; other paths are read
 BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `make demo`
     "certificate.md": {"outputs/tool"},  # by the two before it
-    "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture"},
+    "README.md": {"shots", "optics.yaml", "outputs/board/capture", "session/capture", "outputs/mine"},
     "training.md": {"shipped"},  # the word for networks that come with sonotwin
     "captures.md": {
         "capture",
@@ -81,6 +82,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
         "result/probe/probe.yaml",
         "result/latency/lag.json",
     },
+    "benchmark.md": {"outputs/opencv"},  # of the example beside it
     "live-check.md": {"morning", "lag/lag.json"},
     "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/drift/optics.yaml"}
     | {"now.ply", "before.ply", "masses", "optics.yaml"},
