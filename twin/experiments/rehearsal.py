@@ -6,8 +6,8 @@ rig.
 
 The repeatability CR1 of five calibrations of a dozen images scatters itself by 15 % and more, and their covariances don't tell
 it: these hold what may have moved, and here nothing did; nor do errors drawn at other poses, as much of an error belongs to its
-pose. So calibrations are mixed: the first frame of one of them, the second of another, and so on, each mixture calibrated by
-the real software.
+pose. So calibrations are mixed: frames of all of them, in the order of the image's corners that one of them has, each mixture
+calibrated by the real software.
 """
 
 from collections.abc import Iterable, Sequence
@@ -82,6 +82,7 @@ MASSES = {  # of silicone, with masses of 8 mm in a row under a stroke
 STROKE = SurfacePath(start_mm=(-10.0, -29.0), end_mm=(-10.0, 25.0), speed_mm_s=12.0)
 SWEPT = Clocks(camera_hz=10.0)
 TISSUE_M_S = TISSUES["silicone"].speed
+TANK = Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0)
 IN_WATER = WATER.model_dump(include={"tgc_db_per_cm_mhz", "gain_db"})  # as a scanner is set for wires, which saturate else
 
 
@@ -154,7 +155,7 @@ def calibrate(stage: Stage, count: int) -> Wires:
     InputError
         If a calibration is refused, such as where too few B-scans show the crossing.
     """
-    tank = Tank(temperature_c=WATER_C, wire_radius_sigma_mm=0.0, appearance=Appearance(stage.dynamic_range_db))
+    tank = TANK.model_copy(update={"appearance": Appearance(stage.dynamic_range_db)})
     found, circles, crossings, counts = list[Result](), list[Array](), list[Array](), list[tuple[int, int, int]]()
     sightings = list[Sightings]()
     for number in range(count):
@@ -287,8 +288,9 @@ def rehearse(settings: Settings, calibrations: int, sweeps: int, seed: int) -> R
     stage = of_itself(settings, seed)
     found, probe = calibrate(stage, calibrations), settings.rig.probe
     mixed = mixtures(found.sightings, probe)
-    of_wires = found, repeatability_of(mixed, found, probe.image_size), place_error(stage, mixed)
-    return Rehearsed(*of_wires, joined([segmented_exactly(stage, number) for number in range(sweeps)]))
+    of_probe = repeatability_of(mixed, calibrations, probe.image_size)
+    swept = joined([segmented_exactly(stage, number) for number in range(sweeps)])
+    return Rehearsed(found, of_probe, place_error(stage, mixed), swept)
 
 
 def noise_of(settings: Settings, found: Wires) -> Noise:
@@ -299,22 +301,33 @@ def noise_of(settings: Settings, found: Wires) -> Noise:
 
 
 def mixtures(found: Sequence[Sightings], design: Probe, seed: int = 0) -> list[ProbeCalibration]:
-    """Calibrations that have each frame from one of n calibrations at random; those that are refused are left out."""
-    rng, mixed, count = np.random.default_rng(seed), list[ProbeCalibration](), min(len(one.pixels) for one in found)
+    """Calibrations by frames of n calibrations, each frame once at most; those that are refused are left out.
+
+    The crossing of each mixture goes from corner to corner of the image as in one of the calibrations, at random: frames from
+    anywhere would leave some corner empty, and in another order an error of a corner could look like a movement.
+    """
+    rng, mixed, frames = np.random.default_rng(seed), list[ProbeCalibration](), point_calibration.joined(found)
+    middle = (np.array(design.image_size) - 1) / 2
+    quarters = [(one.pixels > middle) @ [1, 2] for one in found]
+    there = [np.flatnonzero(np.concatenate(quarters) == quarter) for quarter in range(4)]
     for _ in range(MIXTURES):
-        chosen = rng.integers(len(found), size=count)
-        some = point_calibration.joined([found[which].of([frame]) for frame, which in enumerate(chosen)])
+        visited = quarters[rng.integers(len(found))]
+        chosen = np.empty(len(visited), int)
+        for quarter, some in enumerate(there):
+            chosen[visited == quarter] = rng.permutation(some)[: (visited == quarter).sum()]
         with suppress(InputError):
-            adjusted = point_calibration.calibrate(some, design.image_size, expected=design.target_from_image.matrix())
+            adjusted = point_calibration.calibrate(
+                frames.of(chosen), design.image_size, expected=design.target_from_image.matrix(), ahead_mm=TANK.echo_ahead_mm
+            )
             mixed.append(adjusted.calibration)
     return mixed
 
 
-def repeatability_of(mixed: Sequence[ProbeCalibration], found: Wires, size: tuple[int, int]) -> Repeatability:
-    """CR1 of mixtures of n calibrations, two of which share a frame by a chance of 1 / n, by which they are alike.
+def repeatability_of(mixed: Sequence[ProbeCalibration], count: int, size: tuple[int, int]) -> Repeatability:
+    """CR1 of mixtures of so many calibrations, two of which share a part 1 / count of their frames in the mean.
 
-    Variances of differences are so (1 - 1 / n) of those of calibrations by frames of their own. Mixtures tell CR1 as well as the
-    n calibrations themselves do, or better.
+    Variances of differences are so (1 - 1 / count) of those of calibrations by frames of their own. Mixtures tell CR1 as well as
+    these calibrations themselves do, or better.
 
     Raises
     ------
@@ -323,12 +336,11 @@ def repeatability_of(mixed: Sequence[ProbeCalibration], found: Wires, size: tupl
     """
     if len(mixed) < MIXTURES // 2:
         raise InputError(f"rehearsals: expected mixtures of calibrations that succeed, found {len(mixed)} of {MIXTURES} that do")
-    rng, count = np.random.default_rng(0), len(found.sightings)
+    rng = np.random.default_rng(0)
     few = [cr1([mixed[k] for k in rng.permutation(len(mixed))[:FEW]], size) for _ in range(SETS)]
     of_few = float(np.std(few) / np.mean(few))
-    return Repeatability(
-        cr1(mixed, size) / float(np.sqrt(1 - 1 / count)), of_few, of_few * float(np.sqrt((FEW - 1) / (count - 1)))
-    )
+    known = of_few * float(np.sqrt((FEW - 1) / (count - 1)))
+    return Repeatability(cr1(mixed, size) / float(np.sqrt(1 - 1 / count)), of_few, known)
 
 
 def place_error(stage: Stage, mixed: Sequence[ProbeCalibration]) -> float:
@@ -345,7 +357,7 @@ def cr1(calibrations: Sequence[ProbeCalibration], size: tuple[int, int]) -> floa
 
 
 def masses(stage: Stage, number: int) -> PlannedSweep:
-    """A stroke over masses in a row, in tissue of its own for each number."""
+    """A stroke over masses in a row, of other forms for each number, in the same tissue."""
     scene = MASSES | {"seed": number}
     return plan_sweep(_sweep(stage, f"masses{number}", scene, stage.settings.ultrasound, STROKE, SWEPT))
 

@@ -86,7 +86,7 @@ def repeatabilities(rehearsed: Rehearsed, found: Wires, probe: Probe) -> Metrics
 
     Held is the CR1 of the few if it is within 95 % of their scatter and of the prediction's own.
     """
-    mixed = rehearsal.repeatability_of(rehearsal.mixtures(found.sightings, probe), found, probe.image_size)
+    mixed = rehearsal.repeatability_of(rehearsal.mixtures(found.sightings, probe), len(found.results), probe.image_size)
     few = rehearsal.cr1([one.adjustment.calibration for one in found.results][: rehearsal.FEW], probe.image_size)
     predicted = rehearsed.repeatability
     scatter = float(np.hypot(predicted.of_few, predicted.known))

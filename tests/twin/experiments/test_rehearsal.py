@@ -35,10 +35,15 @@ def settings() -> Settings:
     return Settings.model_validate(settings_of(defaults("study")))
 
 
-def shown(settings: Settings, number: int) -> tuple[Array, Array, Array]:
-    """Poses : (12, 4, 4) world_from_target, and pixels : (12, 2) of the crossing, with the scale of depths in water."""
+def shown(settings: Settings, number: int, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Poses : (n, 4, 4) world_from_target, and pixels : (n, 2) of the crossing, with the scale of depths in water.
+
+    Four of five poses show it, and the target is lost in some of these.
+    """
     planned = rehearsal.wires(rehearsal.of_itself(settings, 3), number)
-    poses = planned.plan.truth.poses[: rehearsal.IMAGES]
+    poses = planned.plan.truth.poses
+    poses = poses[rng.random(len(poses)) < 0.8][: rehearsal.IMAGES]
+    poses = poses[rng.random(len(poses)) < 0.95]
     local = np.stack([rigid.apply(rigid.invert(pose), crossing(planned.scanned)) for pose in poses])
     scale = np.array(settings.rig.probe.scale_mm_per_px)
     return poses @ np.linalg.inv(settings.rig.probe.target_from_image.matrix()), local[:, :2] / scale, scale
@@ -66,12 +71,15 @@ def propagated(settings: Settings, poses: Array, pixels: Array, scale: Array, po
 
 
 def test_cr1_of_mixtures_is_that_of_least_squares_however_few_are_mixed(settings, rng, monkeypatch):
-    """Of eight calibrations with 96 frames, and of these two by two, in the mean of four: both are known to 5 %."""
-    monkeypatch.setattr(rehearsal, "MIXTURES", 30)
+    """Of eight calibrations by their own poses, and of these two by two, in the mean of four: to 10 %, 1 sigma.
+
+    Frames from anywhere in the image would leave some corner empty, and their CR1 would be larger.
+    """
+    monkeypatch.setattr(rehearsal, "MIXTURES", 20)
     size, of_pose = settings.rig.probe.image_size, np.array([SIGMA_RAD] * 3 + [SIGMA_MM] * 3)
     sightings, covariances = [], []
     for number in range(8):
-        poses, pixels, scale = shown(settings, number)
+        poses, pixels, scale = shown(settings, number, rng)
         covariances.append(propagated(settings, poses, pixels, scale, repeatability.five_points(size)))
         steps, errors = rng.standard_normal((len(poses), 6)) * of_pose, SIGMA_PX * rng.standard_normal(pixels.shape)
         sightings.append(
@@ -84,15 +92,39 @@ def test_cr1_of_mixtures_is_that_of_least_squares_however_few_are_mixed(settings
         )
 
     def cr1(some: list[Sightings]) -> rehearsal.Repeatability:
-        wires = Wires((), SEEN, tuple(some))
-        return rehearsal.repeatability_of(rehearsal.mixtures(some, settings.rig.probe), wires, size)
+        return rehearsal.repeatability_of(rehearsal.mixtures(some, settings.rig.probe), len(some), size)
 
     expected = repeatability.expected_cr1(np.array(covariances)).mean()
     found = cr1(sightings)
-    assert found.mm == pytest.approx(expected, rel=0.15)
+    assert found.mm == pytest.approx(expected, rel=0.2)
     assert 0.08 < found.of_few < 0.3 and found.known == pytest.approx(found.of_few * np.sqrt(4 / 7))
     by_two = [cr1(sightings[first : first + 2]).mm for first in range(0, 8, 2)]
     assert np.mean(by_two) == pytest.approx(expected, rel=0.2)
+
+
+def test_mixtures_go_from_corner_to_corner_as_a_calibration_and_have_no_frame_twice(settings, rng, monkeypatch):
+    mixed, middle = [], np.array(settings.rig.probe.image_size) / 2
+    monkeypatch.setattr(
+        rehearsal.point_calibration, "calibrate", lambda seen, *_, **__: mixed.append(seen) or SimpleNamespace(calibration=None)
+    )
+    sightings = [Sightings(*shown(settings, number, rng)[:2]) for number in range(3)]
+    rehearsal.mixtures(sightings, settings.rig.probe)
+    ways, expected = ([(one.pixels > middle).tolist() for one in some] for some in (mixed, sightings))
+    assert all(way in expected for way in ways) and all(way in ways for way in expected)
+    assert all(len(np.unique(one.poses, axis=0)) == len(one.poses) for one in mixed)
+
+
+def test_calibrations_without_errors_place_the_image_where_it_is(settings, rng, monkeypatch):
+    """The wires' echo comes from before their axes, in water, whose depths are shown too deep by 3.5 %."""
+    monkeypatch.setattr(rehearsal, "MIXTURES", 2)
+    exact = settings.model_copy(update={"wire_path": settings.wire_path.model_copy(update={"miss_mm": 0.0})})
+    slower = TISSUES["water"].speed / settings.ultrasound.assumed_speed
+    ahead, sightings = rehearsal.TANK.echo_ahead_mm, []
+    for number in range(2):
+        poses, pixels, scale = shown(exact, number, rng)
+        sightings.append(Sightings(poses, (pixels - [0.0, ahead / scale[1]]) / [1.0, slower]))
+    mixed = rehearsal.mixtures(sightings, settings.rig.probe)
+    assert rehearsal.place_error(rehearsal.of_itself(exact, 3), mixed) < 1e-3 < ahead / 40
 
 
 def test_noise_is_told_along_an_axis_whatever_a_few_fingers_cover(rng):
