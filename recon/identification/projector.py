@@ -5,8 +5,7 @@ blurs, with an albedo and an ambient light of its own. These and x are eliminate
 left of thousands of pixels tells what all share: how light depends on grey levels, how sharp it is and how that changes with
 depth, and how far frames differ from each other. Harmonics tell gamma; edges of bits, and modulations of several pitches, blur.
 
-Light must come from where the projector sends it: skin and other translucent things spread it, and look like a blurred lens. So
-does light from one place to another. Of fine stripes it is the same in all frames; a code's wide ones don't count.
+Light must come from where the projector sends it: skin and other translucent things spread it, and look like a blurred lens.
 
 Sources: Golub and Pereyra 1973 (variable projection); Liang and Zeger 1986 (covariance by clusters); Fuller 1987 (errors in
 variables); docs/physics-optics.md.
@@ -26,7 +25,7 @@ from recon.geometry.camera import Camera, distorted
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.frame_scatter import NINETY_FIVE, Scatter, scatter
 from recon.identification.projected_light import Footprint, mirror_weights
-from recon.model.patterns import Axis, Fringes, GrayCode, Patterns, Uniform
+from recon.model.patterns import Axis, Fringes, Patterns, Uniform
 from recon.model.rig import ProjectorDevice
 from recon.structured_light.decode import ProjectorMap, Status
 from recon.structured_light.phase import Noise
@@ -62,7 +61,6 @@ DIM = 1.5  # of noise in the dark, from which on what is clipped at 0 adds 3 % o
 BLIND = 1e-9  # of the best known direction: one that is known less is one that the images can not show
 SHIFTS = 2  # among gains, offsets and shifts
 FAITHFUL = 1.2  # times the noise, which residuals of a faithful model reach at most
-WIDEST = 2.5  # pitches of the finest fringes, of a code's stripes that count
 FRINGES = 8  # images, that show frames' errors by themselves
 FEW = 1000  # pixels of a search
 AT_ONCE = 200  # pixels: slopes of more leave the cache, and of fewer the interpreter takes most of the time
@@ -158,7 +156,7 @@ class Response:
     albedo: Array  # (p,) DN
     ambient: Array  # (p,) DN
     residuals: Array  # (n, p) DN
-    noise_dn: Array  # (n, p), infinite where frames don't count
+    noise_dn: Array  # (n, p)
 
 
 def identify(
@@ -594,9 +592,8 @@ def fit(
     middle = float(pixels.vergence.mean())
     prior = np.array([*START, middle, blur.blur_px])
     sigma = np.append(SPREAD, max(blur.sigma_px, 1e-4))
-    level, counted = noise.read_variance + noise.gain * np.maximum(pixels.images.mean(axis=0), 0), fine_stripes(patterns)
-    used = np.count_nonzero(counted) * len(level)
-    weights = counted[:, None] / level
+    level = noise.read_variance + noise.gain * np.maximum(pixels.images.mean(axis=0), 0)
+    weights = np.broadcast_to(1 / level, pixels.images.shape)
     model = Model(pixels, patterns, weights, prior, sigma, FRAMES * unit, np.zeros(patterns.count))
     few = np.arange(0, len(pixels.block), max(1, len(pixels.block) // FEW))
     sides = []
@@ -609,11 +606,11 @@ def fit(
     for _ in range(ROUNDS):
         state, system, *_ = _descended(model, state, FINE)
         *_, shown = model.show(state)
-        excess2 = (model.weights * (pixels.images - shown) ** 2).sum() / (used - system.pulled.size)
+        excess2 = (model.weights * (pixels.images - shown) ** 2).sum() / (shown.size - system.pulled.size)
         scatters = _scatters(model, state, system, unit, excess2)
         if excess2 < FAITHFUL**2:
             frame_sigma = np.maximum([one.value for one in scatters], LEAST_FRAMES) * unit
-        weights = counted[:, None] / (noise.read_variance + noise.gain * np.maximum(shown, 0))
+        weights = 1 / (noise.read_variance + noise.gain * np.maximum(shown, 0))
         squares = (weights * (pixels.images - shown) ** 2).mean(axis=0)
         model = replace(
             model,
@@ -625,7 +622,7 @@ def fit(
     grey = any(mirrors.by_gamma.any() for mirrors in mirrors_of(patterns, 2.0, state.frames[2], state.frames[2]))
     system, _, squares = model.equations(state, bend=grey)
     reduced = system.reduced()
-    free = used - reduced.own.size - len(reduced.right)
+    free = pixels.images.size - reduced.own.size - len(reduced.right)
     precision = np.pad(model.precision, (0, 1)) if grey else model.precision
     covariance = _by_blocks(system, reduced, precision)
     covariance[np.ix_(LENS, LENS)] *= LENS_ERROR**2
@@ -650,20 +647,8 @@ def fit(
         albedo=albedo,
         ambient=ambient,
         residuals=pixels.images - shown,
-        noise_dn=np.divide(1.0, np.sqrt(model.weights), out=np.full_like(model.weights, np.inf), where=model.weights > 0),
+        noise_dn=1 / np.sqrt(model.weights),
     )
-
-
-def fine_stripes(patterns: Patterns) -> NDArray[np.bool_]:
-    """Frames that count : (n,), all but those of a code with stripes that are wide beside the finest fringes."""
-    fine = np.ones(patterns.count, bool)
-    for part, place in patterns.slices():
-        if isinstance(part, GrayCode):
-            length = patterns.length(part.axis)
-            pitches = [one.pitch for one in patterns.parts if isinstance(one, Fringes) and one.axis == part.axis]
-            edges = np.count_nonzero(np.diff(part.profiles(length), axis=1), axis=1)
-            fine[place] = length / (edges + 1) <= WIDEST * min(pitches, default=np.inf)
-    return fine
 
 
 def _descended(model: Model, start: State, rules: Rules) -> Descent[State, System, Step]:

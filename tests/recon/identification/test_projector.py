@@ -9,7 +9,6 @@ from recon.errors import InputError
 from recon.identification import projector
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur, Selection
-from recon.model.patterns import Fringes, GrayCode, Patterns
 from recon.structured_light.decode import decode
 from recon.structured_light.phase import Noise
 from sonotwin.choices import read_patterns
@@ -58,29 +57,6 @@ def test_intervals_of_drawn_projectors_hold_what_they_say(rig, rng):
         lenses += "projector.lens.focus_mm" in found.estimates
     held = np.mean(np.abs(off) < 1.96)
     assert held > 0.95 - 3 * np.sqrt(0.95 * 0.05 / len(off)) and np.std(off) > 0.5 and lenses >= 3
-
-
-@pytest.mark.slow
-def test_light_from_other_places_under_wide_stripes_moves_nothing(rig, rng):
-    """4 % of the light, from what a code's wide stripes light: less than a tenth of a sigma."""
-    patterns, blur = read_patterns("gray_surface"), CameraBlur(0.5, CAMERA_SIGMA)
-    device, devices = rig.projector.model_copy(update={"gamma": 2.0}), (fringe_images.CAMERA, fringe_images.PROJECTOR)
-    shown = fringe_images.photograph(device, Frames(), patterns, rig.cam1.sensor, (610.0, 700.0), 0.5, rng)
-    found, few = decode(shown.images, patterns), Selection(pixels=1000)
-    pixels = projector.sample(shown.images, patterns, found, shown.points, devices, blur, selection=few)
-    wide = ~projector.fine_stripes(patterns)
-    assert wide.any() and (~wide).any()
-    own = projector.fit(pixels, patterns, found.noise, blur, selection=few)
-    more = pixels.images * (1 + 0.04 * wide[:, None] * (pixels.uv[:, 0] < np.median(pixels.uv[:, 0])))
-    other = projector.fit(pixels._replace(images=more), patterns, found.noise, blur, selection=few)
-    assert np.abs(other.shared - own.shared) / np.sqrt(np.diag(own.covariance)) == pytest.approx(0, abs=0.1)
-
-
-def test_stripes_of_a_code_count_where_they_are_fine():
-    """Of 24 px and 12 px beside fringes of 12 px."""
-    parts = (Fringes(pitch=12, steps=8), GrayCode(pitch=12, bits=7, complementary=True))
-    fine = projector.fine_stripes(Patterns(projector_size=(1280, 800), unwrap="gray", parts=parts))
-    assert fine.tolist() == [True] * 8 + [False] * 6 + [True] * 2
 
 
 def test_too_few_pixels_are_refused_with_the_cause(rig, rng):
