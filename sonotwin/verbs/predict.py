@@ -8,17 +8,17 @@ lengths, of which `identify` measures none, and often others. The projector's li
 `changes` are other values of any fields, each with its price: they are tried one by one, the most error saved for the money
 first. Takes some seconds.
 
-The noise of camera 1, the projector's raster and the errors of a calibration whose covariance the rig has are in it; flicker, and
-light that spreads in skin, aren't. Fringes along columns, rows or both count as in the reconstruction, and Gray code alone by its
-cells. With `sessions` whole ones
-are drawn, from the board to a mass, with the errors of `conditions`: what detectors would find is drawn, and the real software
-does the rest. They say the errors of points, pixels of B-scans and masses' centres. With `rehearsals` the rig's twin calibrates
-its probe by crossed wires and sweeps a phantom's masses so many times, by rendered frames and B-scans, a minute each. That
-says CR1 and the errors of masses, and sessions are drawn with the noise that detectors have there, else with that of the paper's
-rig, scaled to this one.
+The noise of camera 1, the projector's raster and the errors of a calibration whose covariance the rig has are in it; light that
+spreads in skin isn't. Of the errors of frames in `conditions` flicker costs light, as the exposure is set for the brightest
+frame; all of them count to the phases of three steps, while those of four or more are corrected. Fringes along columns, rows or
+both count as in the reconstruction, and Gray code alone by its cells. With `sessions` whole ones are drawn, from the board to a
+mass, with the errors of `conditions`: what detectors would find is drawn, and the real software does the rest. They say the
+errors of points, pixels of B-scans and masses' centres. With `rehearsals` the rig's twin calibrates its probe by crossed wires
+and sweeps a phantom's masses so many times, by rendered frames and B-scans, a minute each. That says CR1 and the errors of
+masses, and sessions are drawn with the noise that detectors have there, else with that of the paper's rig, scaled to this one.
 
     sonotwin predict
-    sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700]
+    sonotwin predict patterns=gray_surface plate.centre_mm=[4,-2,700] conditions.frames.flicker=0.02
     sonotwin predict conditions=lifelike sessions=24 rehearsals=2
     sonotwin predict "changes={rig.projector.radiant_flux_w: {to: 1.2, price: 800}, patterns.parts.1.steps: {to: 16, price: 0}}"
 """
@@ -107,7 +107,9 @@ def describe(config: Config, changed: Mapping[str, Config]) -> Iterator[str]:
     unknown = "of unknown uncertainty: none of the rig's numbers was measured, see `sonotwin identify`"
     yield f"predicted   plane {found.rms_mm:.4f} mm RMS, {known if rig.measured else unknown}"
     optics = "not counted (no covariance in the rig)" if rig.optics_covariance is None else f"{found.optics_mm:.4f} mm"
-    parts = f"noise {found.noise_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm, calibration {optics}"
+    parts = (
+        f"noise {found.noise_mm:.4f} mm, frames {found.frames_mm:.4f} mm, raster {found.mirrors_mm:.4f} mm, calibration {optics}"
+    )
     yield f"by          {parts}; modulation {found.modulation_dn:.0f} DN, exposure {1e3 * found.exposure_s:.2f} ms"
     if config.rehearsals or config.sessions:
         yield from _sessions(config, _session(config))
@@ -151,7 +153,7 @@ def _rehearsed(found: Rehearsed) -> Iterator[str]:
 
 def measurement_of(config: Config) -> Measurement:
     """What is to be measured."""
-    return Measurement(config.patterns, config.plate, config.shooting, config.tracing)
+    return Measurement(config.patterns, config.plate, config.shooting, config.tracing, config.conditions.frames)
 
 
 def _session(config: Config) -> Settings:

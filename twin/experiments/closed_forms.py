@@ -36,6 +36,23 @@ def phase_sigma(steps: int, noise_dn: float, modulation_dn: float) -> float:
     return float(np.sqrt(2 / steps) * noise_dn / modulation_dn)
 
 
+def phase_sigma_of_frames(steps: int, flicker: float, stray: Array, shift: float, level: Array) -> Array:
+    """Standard deviation of the phase of N steps, rad, over a surface, by errors that each frame has anew, before correction.
+
+    A frame's error dI moves the phase by `-2 / (N B) dI sin(phase + shift)`; the squares' means over all phases add up. The mean
+    of the shifts moves the whole surface, and isn't counted.
+
+    Parameters
+    ----------
+    flicker : standard deviation of the light, relative
+    stray : (n,) standard deviation of light from elsewhere, over the modulation B
+    shift : standard deviation of the shifts, in steps
+    level : (n,) mean light of the projector over B
+    """
+    by_light = 2 / steps * (stray**2 + flicker**2 * (level**2 + 1 / 4))
+    return np.sqrt(by_light + (2 * np.pi / steps * shift) ** 2 / (2 * steps))
+
+
 def contrast(rig: Rig, fringes: Fringes, place: Array) -> Array:
     """Modulation of fringes over their mean brightness, B / A, in camera 1's images of a surface at places : (..., 3) mm.
 

@@ -5,6 +5,7 @@ The scanner's has its probe's label and the phantom's sheet, both with errors; a
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,7 +28,7 @@ from scenes.board_poses import Config as BoardPoses
 from scenes.catalogue import build_scene
 from scenes.kinds import plane
 from twin import board_session
-from twin.conditions import Conditions
+from twin.conditions import Conditions, Frames
 from twin.devices.still_scenes import even_radiance
 from twin.experiments import drawn_rig, predicted_plane, surface_accuracy
 from twin.experiments.experiment_runs import Experiment, Settings
@@ -93,7 +94,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
         identified, found = identify_recorded(rig, conditions, array, Path(folder), settings.poses.seed + seed, seed)[:2]
     judged = judge(found, truth_of(rig, conditions, array, found))
     judged["optics_error_over_sigma"] = normalised_error(identified.calibration(), rig.calibration())
-    return judged | choose_setting(rig, identified, conditions, seed)
+    return judged | choose_setting(rig, identified, conditions, seed, frames_of(found))
 
 
 def identify_recorded(
@@ -233,8 +234,16 @@ def _is_further_term(name: str, rig: Rig) -> bool:
     return bool(found) and int(term) >= len(getattr(rig, device).optics.distortion)
 
 
-def choose_setting(rig: Rig, identified: Rig, conditions: Conditions, seed: int) -> Metrics:
+def frames_of(found: Findings) -> Frames:
+    """Errors of frames as identified; none of what is unknown."""
+    group = "conditions.frames."
+    return Frames(**{name.removeprefix(group): one.value for name, one in found.estimates.items() if name.startswith(group)})
+
+
+def choose_setting(rig: Rig, identified: Rig, conditions: Conditions, seed: int, frames: Frames) -> Metrics:
     """Errors of a plane with each setting, as predicted of the identified rig, over those that are found; and their ranking.
+
+    frames : their errors as identified; the sheet says nothing of them
 
     The true rig records the plane, and points are by the identified one's calibration, in the middle of camera 1's image.
     Settings are ranked if they come in the order of what is found; likewise by predictions of the sheet.
@@ -249,7 +258,8 @@ def choose_setting(rig: Rig, identified: Rig, conditions: Conditions, seed: int)
             true, plane.build(PLATE), patterns, seed, chosen.tracing, chosen.shooting, conditions, known
         )
         found[k] = seen.metrics["plane_plate_rms_mm"]
-        by_twin[k], by_sheet[k] = (predicted_plane.predict(one, chosen).rms_mm for one in (known, sheet))
+        by_twin[k] = predicted_plane.predict(known, replace(chosen, frames=frames)).rms_mm
+        by_sheet[k] = predicted_plane.predict(sheet, chosen).rms_mm
     figures: Metrics = {}
     for k, name in enumerate(SETTINGS):
         figures |= {f"{name}_found_mm": float(found[k]), f"{name}_predicted_over_found": float(by_twin[k] / found[k])}

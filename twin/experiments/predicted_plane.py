@@ -2,10 +2,13 @@
 
 At places all over the view: the light that comes back, the noise and the modulation of the finest fringes in it, the phase's
 error, and the plane's by the slope of the projector's column along the camera's ray, or row, or both as they are weighed by the
-triangulation; and what a calibration with covariance lets the plane bend. Of Gray code alone it is the error of its cells. Errors
-of frames that the decoder leaves are not in it.
+triangulation; and what a calibration with covariance lets the plane bend. Of Gray code alone it is the error of its cells.
 
-Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise.
+A projector that flickers costs light, as exposures are set for its brightest frame. Errors of frames in a phase are the decoder's
+to find, by four steps or more; what it leaves isn't counted, but by three steps all of them are.
+
+Sources: docs/physics-optics.md for light and sensor; Greivenkamp 1984 for the phase's noise; Blom 1958 for the largest of n
+normal numbers.
 """
 
 from collections.abc import Sequence
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 from recon.errors import InputError
 from recon.geometry import rigid
@@ -23,7 +27,9 @@ from recon.identification.estimates import Estimate, Findings
 from recon.model.patterns import Axis, Fringes, GrayCode, Patterns
 from recon.model.rig import CameraDevice, ProjectorDevice, Rig
 from recon.optical_calibration import uncertainty as calibrated
+from recon.structured_light.frame_errors import LEAST_STEPS
 from scenes.kinds import plane
+from twin.conditions import IDEAL, Frames
 from twin.experiments import closed_forms, predicted_cells
 from twin.experiments.predicted_cells import Light
 from twin.optics.light_transport import Tracing
@@ -47,6 +53,7 @@ class Measurement:
     plate: plane.Config
     shooting: Shooting
     tracing: Tracing
+    frames: Frames = IDEAL.frames
 
 
 class Prediction(NamedTuple):
@@ -54,6 +61,7 @@ class Prediction(NamedTuple):
 
     rms_mm: float
     noise_mm: float  # by the cameras' noise alone; 0 of Gray code alone, whose cells it may widen
+    frames_mm: float  # by errors of frames alone, as far as the decoder can't find them
     mirrors_mm: float  # by the projector's raster alone, or by the cells of Gray code alone
     optics_mm: float  # by errors of the calibration alone, as they are expected; 0 if the rig has no covariance
     optics_sigma_mm2: float  # standard deviation of the square of that, from one calibration to the next
@@ -87,7 +95,9 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     if any(not isinstance(part, Fringes) for part in patterns.parts):
         peak = np.ones_like(peak)  # a code's stripes, or a uniform image
     electron = electrons_per_radiance(rig.cam1, rig.projector.wavelength_nm)
-    brightest = float(np.percentile(radiance * peak + room, BRIGHTEST)) * electron  # a second
+    bright = [part.count for part in patterns.parts if not isinstance(part, Fringes)] or [one.count for one in sets]
+    lit = radiance * peak * (1 + measurement.frames.flicker * largest_normal(sum(bright)))
+    brightest = float(np.percentile(lit + room, BRIGHTEST)) * electron  # a second
     longest_s = sensor.saturation_e / (brightest * shooting.gain)
     time_s = shooting.exposure_s or shooting.level * longest_s
     if time_s > longest_s:
@@ -97,15 +107,16 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     light = Light(radiance * electron * time_s, room * electron * time_s + sensor.dark_current_e_per_s * time_s)
     mm_a_px = slopes.T[[AXES.index(axis) for axis in fringed]]
     found = (
-        _by_fringes(rig, sets, waves, points, mm_a_px, light, exposure)
+        _by_fringes(rig, sets, waves, points, mm_a_px, light, exposure, measurement.frames)
         if sets
         else _by_cells(rig, patterns, points, mm_a_px, light, exposure)
     )
     bent2, bent2_sigma = _bent(rig, points, flat.normal, found.sigma_px)
     view = len(points) / (GRID[0] * GRID[1])
     return Prediction(
-        float(np.sqrt(found.noise_mm**2 + found.mirrors_mm**2 + bent2)),
+        float(np.sqrt(found.noise_mm**2 + found.frames_mm**2 + found.mirrors_mm**2 + bent2)),
         found.noise_mm,
+        found.frames_mm,
         found.mirrors_mm,
         float(np.sqrt(bent2)),
         bent2_sigma,
@@ -115,21 +126,34 @@ def predict(rig: Rig, measurement: Measurement) -> Prediction:
     )
 
 
+def largest_normal(count: int) -> float:
+    """The largest of some standard normal numbers, as it is expected, to 0.02."""
+    return float(stats.norm.ppf((count - 0.375) / (count + 0.25)))
+
+
 class _Found(NamedTuple):
     """Errors of a plane's points by what is projected, RMS over its places."""
 
     noise_mm: float
+    frames_mm: float
     mirrors_mm: float
     modulation_dn: float  # median, of the axis that counts most
     sigma_px: dict[Axis, float]  # of the projector's coordinates
 
 
 def _by_fringes(
-    rig: Rig, sets: Sequence[Fringes], waves: "Sequence[_Wave]", points: Array, mm_a_px: Array, light: Light, exposure: Exposure
+    rig: Rig,
+    sets: Sequence[Fringes],
+    waves: "Sequence[_Wave]",
+    points: Array,
+    mm_a_px: Array,
+    light: Light,
+    exposure: Exposure,
+    frames: Frames,
 ) -> _Found:
     """By the phases of fringes of each axis, as they are weighed; mm_a_px : (axes, n)."""
     per_electron = number_per_electron(rig.cam1.sensor, exposure)
-    by_noise, by_mirrors, modulations, sigma_px = [], [], [], dict[Axis, float]()
+    by_noise, by_frames, by_mirrors, modulations, sigma_px = [], [], [], [], dict[Axis, float]()
     for fringes, wave, slope in zip(sets, waves, mm_a_px, strict=True):
         weighed = wave.mean - wave.second / 2  # light at the steps by which the phase is known, where it is steep: sin^2
         counted_e = light.projector * weighed + light.room
@@ -138,12 +162,19 @@ def _by_fringes(
         phase = np.sqrt(2 / fringes.steps) * noise / modulations[-1]
         sigma_px[fringes.axis] = float(np.median(phase)) * fringes.pitch / (2 * np.pi)
         by_noise.append(mm_a_rad * phase)
+        stray = frames.stray_dn * 2 ** (exposure.bits - 8) / modulations[-1]
+        unfound = closed_forms.phase_sigma_of_frames(
+            fringes.steps, frames.flicker, stray, frames.shift, wave.mean / wave.amplitude
+        )
+        by_frames.append(mm_a_rad * unfound * (fringes.steps < LEAST_STEPS))
         by_mirrors.append(mm_a_rad * closed_forms.raster_sigma(rig, fringes, points))
     weights = np.array(by_noise) ** -2.0
     weights /= weights.sum(axis=0)
-    noise_mm, mirrors_mm = (float(np.sqrt(np.mean(np.nansum((weights * one) ** 2, axis=0)))) for one in (by_noise, by_mirrors))
+    noise_mm, frames_mm, mirrors_mm = (
+        float(np.sqrt(np.mean(np.nansum((weights * one) ** 2, axis=0)))) for one in (by_noise, by_frames, by_mirrors)
+    )
     modulation = float(np.median(modulations[int(np.argmax(weights.mean(axis=1)))]))
-    return _Found(noise_mm, mirrors_mm, modulation, sigma_px)
+    return _Found(noise_mm, frames_mm, mirrors_mm, modulation, sigma_px)
 
 
 def _by_cells(rig: Rig, patterns: Patterns, points: Array, mm_a_px: Array, light: Light, exposure: Exposure) -> _Found:
@@ -161,7 +192,7 @@ def _by_cells(rig: Rig, patterns: Patterns, points: Array, mm_a_px: Array, light
         sigma_px[code.axis] = float(np.median(read.sigma[known]))
     cells_mm = float(np.sqrt(np.mean((off[weight > 0] / weight[weight > 0]) ** 2)))
     modulation = float(np.median(light.projector)) * (1 - 1 / rig.projector.contrast) / 2
-    return _Found(0.0, cells_mm, modulation * number_per_electron(rig.cam1.sensor, exposure), sigma_px)
+    return _Found(0.0, 0.0, cells_mm, modulation * number_per_electron(rig.cam1.sensor, exposure), sigma_px)
 
 
 def _seen(rig: Rig, flat: Plane, plate: plane.Config) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from recon.identification import projector
 from recon.identification.estimates import Estimate, Findings
 from recon.identification.projector import CameraBlur, Selection
 from recon.structured_light.decode import decode
+from recon.structured_light.phase import Noise
 from sonotwin.choices import read_patterns
 from tests.recon.identification import fringe_images
 from twin.conditions import Frames
@@ -75,6 +76,26 @@ def test_too_few_pixels_are_refused_with_the_cause(rig, rng):
     for cause, (images, one) in spoilt.items():
         with pytest.raises(InputError, match=cause):
             projector.sample(images, patterns, one, shown.points, devices, blur)
+
+
+def test_noise_may_reach_the_end_of_the_range_in_dark_stripes(rig, rng):
+    """By 1.4 of 3 DN, of which 0.4 % of a DN is clipped in the mean; by 6 DN too much is, and pixels are refused."""
+    patterns, blur = read_patterns("gray_surface"), CameraBlur(0.5, CAMERA_SIGMA)
+    device, devices = rig.projector.model_copy(update={"contrast": 1e5}), (fringe_images.CAMERA, fringe_images.PROJECTOR)
+    for noise_dn, enough in ((1.4, True), (6.0, False)):
+        clipped = rng.normal(3.0, noise_dn, 1_000_000).clip(0).mean() - 3
+        dim = {"black_level_dn": 0.0, "dark_noise_e": noise_dn * rig.cam1.sensor.saturation_e / 256}
+        sensor = rig.cam1.sensor.model_copy(update=dim)
+        shown = fringe_images.photograph(device, Frames(), patterns, sensor, (640.0, 680.0), 0.5, rng)
+        found = replace(decode(shown.images, patterns), noise=Noise(noise_dn**2, 256 / sensor.saturation_e))
+        selection = Selection(place_px=1.0)
+        if enough:
+            chosen = projector.sample(shown.images, patterns, found, shown.points, devices, blur, selection=selection)
+            assert len(chosen.block) > 500 and clipped < 0.01
+        else:
+            assert clipped > 0.5
+            with pytest.raises(InputError, match="at 0, the end of the range"):
+                projector.sample(shown.images, patterns, found, shown.points, devices, blur, selection=selection)
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def test_settings_are_ranked_by_the_twin_of_the_rig_itself(rig, monkeypatch):
     monkeypatch.setattr(identify_trial, "MIDDLE_PX", (96, 80))
     monkeypatch.setattr(identify_trial, "FINE_TRACING", Tracing(samples=128, room_lux=20))
     drawn, conditions = drawn_rig.draw(rig, 0)
-    found = identify_trial.choose_setting(drawn, drawn, conditions, 0)
+    found = identify_trial.choose_setting(drawn, drawn, conditions, 0, conditions.frames)
     assert [found[f"{name}_predicted_over_found"] for name in identify_trial.SETTINGS] == pytest.approx([1, 1, 1], abs=0.08)
     assert (found["ranked"], found["ranked_by_sheet"]) == (1, 0)
     assert found["designed_found_mm"] < found["half_light_found_mm"] < found["fine_third_light_found_mm"]
