@@ -3,6 +3,7 @@
 import csv
 import json
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -61,6 +62,19 @@ def test_perfect_results_have_no_error(truth, tmp_path):
     assert float(found["optics", "cam2_rms_px"]["mean"]) < 1e-6
     assert float(found["tracking", "shift_p95_mm"]["mean"]) < 1e-9
     assert float(found["tracking", "dropped_share"]["mean"]) == 0
+
+
+def test_plain_opencv_gives_two_cameras(truth, tmp_path):
+    """As `benchmarks/open_opencv.py` writes them, without the projector that the truth has."""
+    first, second = (calibration_of(read_rig()).cameras[name] for name in ("cam1", "cam2"))
+    between = second.camera_from_world @ np.linalg.inv(first.camera_from_world)
+    (tmp_path / "results" / OPTICS).mkdir(parents=True)
+    file = cv2.FileStorage(str(tmp_path / "results" / OPTICS / "calibration.yml"), cv2.FILE_STORAGE_WRITE)
+    values = {"M1": first.matrix, "D1": first.distortion, "M2": second.matrix, "D2": second.distortion}
+    for name, value in (values | {"R": between[:3, :3], "T": between[:3, 3:]}).items():
+        file.write(name, np.array(value))
+    file.release()
+    assert float(scores(truth, tmp_path / "results", tmp_path / "out")["optics", "points_rms_mm"]["mean"]) < 1e-6
 
 
 def test_a_shift_of_a_millimetre_is_one(truth, tmp_path):

@@ -71,13 +71,12 @@ def _optics(results: Path, truth: Path) -> Metrics:
     path = _given(results, "calibration", "yaml", "yml", "xml", "npz")
     if path is None:
         return {}
-    true = Calibration(TruthFolder(truth, "board").optics("cam1", "cam2"))
-    found = calibration_files.read(path, {name: camera.size for name, camera in true.cameras.items()}).cameras
-    for name in true.cameras:
-        if name not in found:
-            raise InputError(f"{path}: expected cam1 and cam2, found {', '.join(found) or 'none'}")
-    points = uncertainty.working_volume(true, DEPTHS_MM)
-    cameras = {name: true.cameras[name] for name in ("cam1", "cam2")}
+    devices = TruthFolder(truth, "board").optics("cam1", "cam2")
+    cameras = {name: devices[name] for name in ("cam1", "cam2")}
+    found = calibration_files.read(path, {name: camera.size for name, camera in cameras.items()}).cameras
+    if not found.keys() >= cameras.keys():
+        raise InputError(f"{path}: expected cam1 and cam2, found {', '.join(found) or 'none'}")
+    points = uncertainty.working_volume(Calibration(cameras), DEPTHS_MM)
     pixels = [camera.project(points) for camera in cameras.values()]
     met = figures_of_merit.triangulated([found[name] for name in cameras], pixels, points)
     figures = {"points_rms_mm": surface_errors.rms(np.linalg.norm(met - points, axis=1))}
