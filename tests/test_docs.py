@@ -86,7 +86,7 @@ BROUGHT = {  # what a reader of the page has: by its text, from a rig, or from `
     "live-check.md": {"morning", "lag/lag.json"},
     "live-skin.md": {"result/surface/surface.ply", "result/masses/scan", "result/drift/optics.yaml"}
     | {"now.ply", "before.ply", "masses", "optics.yaml"},
-    "recordings.md": {"photographs", "procam", "L", "caliInfo.yml", "spine.xml", "poses.csv"}
+    "recordings.md": {"photographs", "images", "jet.yaml", "jet", "procam", "L", "caliInfo.yml", "spine.xml", "poses.csv"}
     | {"examples_ybr_color.dcm"}
     | {f"{name}.igs.mha" for name in ("SpinePhantomFreehand", "WaterTankBottomTranslationCombined")},
     "live-navigate.md": {"session/capture", "result/surface/surface.ply", "result/masses/scan"}

@@ -19,6 +19,7 @@ from rich.progress import Progress
 
 from recon.files.occupied import occupied
 from recon.model.rig import Part
+from recon.registry import Choice
 from sonotwin import benchmark_sessions
 from sonotwin.console_watch import LineConsole
 from twin.engine import Engine, results
@@ -27,14 +28,14 @@ from twin.engine import Engine, results
 class Config(Part):
     """Fields of `sonotwin render-benchmark`."""
 
+    engine: Annotated[Engine, Choice("local")]
+    """where sessions are rendered: local or dask; doesn't change a byte"""
     out: Path
     """folder; gets sessions/, truth/, benchmark.json and checksums.sha256"""
     sessions: Annotated[int, Field(ge=1, le=1_000_000)] = 200
     """number of sessions, of the four tasks in turn"""
     seed: Annotated[str, Field(min_length=1, max_length=1000)] = "practice"
     """text from which all is drawn; its SHA-256 is published. A secret one has 20 random letters or more"""
-    engine: Engine = Engine()
-    """where sessions are rendered; doesn't change a byte"""
 
 
 def run(config: Config) -> None:
