@@ -170,7 +170,7 @@ def test_a_search_that_failed_is_not_one_that_found_nothing(scene, tmp_path):
 def test_the_page_has_the_view_its_slider_and_the_masses(scene, tmp_path):
     scene_page.write(tmp_path / "scene.html", scene, "a <title>")
     page = (tmp_path / "scene.html").read_text(encoding="utf-8")
-    assert 'data-slide="scene"' in page and "7.50 ± 0.19" in page and "a &lt;title&gt;" in page
+    assert 'data-slide="scene"' in page and "7.50\u00a0±\u00a00.19" in page and "a &lt;title&gt;" in page
     reel = scene_page.reel_of(scene)
     assert [sheet.image is scene.images[k] for sheet, k in zip(map(reel.sheet_at, range(3)), (0, 2, 4), strict=True)] == [
         True
