@@ -16,6 +16,7 @@ from rich.console import Console
 from recon.capture.sweep_part import read_sweep
 from recon.errors import InputError
 from recon.files import atomic
+from recon.files.code_digest import code_digest
 from recon.freehand import scans
 from recon.model import circle_layout
 from recon.model.patterns import Patterns
@@ -58,18 +59,24 @@ def missing(out: Path, seed: str, count: int) -> list[int]:
     InputError
         If `out` holds another round or something else.
     """
-    path, wanted = out / ROUND, commitment(seed)
+    path, wanted, truths = out / ROUND, commitment(seed), dict[str, str]()
     if path.is_file():
         there = read_json(path)
+        truths = there.get("truth_sha256", {})
         if there.get("seed_sha256") != wanted:
             raise InputError(f"{path}: seed_sha256: expected {wanted} of this seed, found another round; choose another out")
+        if there.get("code_sha256") != code():
+            raise InputError(
+                f"{path}: code_sha256: expected {code()} of this version, found a round that another one began, which may make "
+                "other bytes; go on with that one, or choose another out"
+            )
         if int(there.get("sessions_count", 0)) > count:
             found = there["sessions_count"]
             raise InputError(f"{path}: sessions_count: expected {count} at most, found {found}; choose another out")
     elif out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out}: expected no folder, an empty one or a round of the benchmark, found something else")
     out.mkdir(parents=True, exist_ok=True)
-    _describe_round(out, seed, count, {})
+    _describe_round(out, seed, count, truths)
     numbers = range(count)
     return [k for k in numbers if not (out / SESSIONS / name_of(k)).is_dir() or not (out / TRUTH / name_of(k)).is_dir()]
 
@@ -98,12 +105,27 @@ def write(out: Path, seed: str, number: int) -> str:
 
 
 def finish(out: Path, seed: str, count: int) -> None:
-    """Write the checksums of all sessions' files, and the round's description with those of the truth."""
-    (out / ".making").rmdir() if (out / ".making").is_dir() else None
-    _describe_round(out, seed, count, {name_of(k): _digest(out / TRUTH / name_of(k)) for k in range(count)})
+    """Write the checksums of all sessions' files, and the round's description with those of the truth.
+
+    Raises
+    ------
+    InputError
+        If a truth isn't the one that the round was committed to.
+    """
+    shutil.rmtree(out / ".making", ignore_errors=True)  # what a killed run left
+    truths = {name_of(k): _digest(out / TRUTH / name_of(k)) for k in range(count)}
+    for name, before in read_json(out / ROUND).get("truth_sha256", {}).items():
+        if truths[name] != before:
+            raise InputError(f"{out / TRUTH / name}: expected the truth of SHA-256 {before}, found another: was it edited?")
+    _describe_round(out, seed, count, truths)
     with atomic.new_file(out / SUMS) as temporary:
         lines = [f"{digest}  {SESSIONS}/{place}\n" for place, digest in _files(out / SESSIONS)]
         temporary.write_text("".join(lines), encoding="utf-8")
+
+
+def code() -> str:
+    """Digest of the code that a round is made by."""
+    return code_digest("recon", "scenes", "sonotwin", "twin")
 
 
 def _describe_round(out: Path, seed: str, count: int, truths: dict[str, str]) -> None:
@@ -111,6 +133,7 @@ def _describe_round(out: Path, seed: str, count: int, truths: dict[str, str]) ->
         "format": FORMAT,
         "licence": "CC0-1.0",
         "seed_sha256": commitment(seed),
+        "code_sha256": code(),
         "sessions_count": count,
         "results": WANTED,
         "truth_sha256": truths,

@@ -4,7 +4,7 @@
 here imports napari. Its axes are z, y, x, in mm.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +25,7 @@ VOLUMES = {"volume": "gray", "sigma": "magma", "seen": "green"}  # files of `son
 SURFACES = {"surface": "gray", "skin": "bop orange"}
 NINETY_FIVE = 1.96
 FROM_TOP = 2  # folders below the one that is opened in which results may lie
-LEAST_MM = 0.1  # size of a centre that counts as exact, or whose sigma isn't known
-LEFT_OUT_MM = 3.0  # size of a mark where something was left out
+MARK_MM = 3.0  # size of a mark where something was left out, or a centre is of unknown uncertainty
 
 
 def find(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
@@ -56,12 +55,11 @@ def read(path: str | list[str]) -> list[Layer]:
     for folder in sorted(folders):
         masses = mass_files.read_masses(folder)
         layers += [surface_layer(name, mass.mesh, "red") for name, mass in masses.items()]
-        if masses:
-            layers.append(centres_layer(masses))
+        layers += centres_layers(masses)
         if missing := left_out.read(folder / left_out.FILE):
             places = np.array([one.centre_mm for one in missing])[:, ::-1]
             told = {"reason": [one.reason for one in missing], "text": [one.text for one in missing]}
-            looks = {"size": LEFT_OUT_MM, "face_color": "yellow", "symbol": "cross", "text": "{reason}"}
+            looks = {"size": MARK_MM, "face_color": "yellow", "symbol": "cross", "text": "{reason}"}
             layers.append((places, {"name": "left out", "features": told, **looks}, "points"))
     return layers
 
@@ -89,14 +87,24 @@ def surface_layer(name: str, mesh: trimesh.Trimesh, colour: str) -> Layer:
     return data, {"name": name, "colormap": colour, "shading": "smooth", "opacity": 0.7}, "surface"
 
 
-def centres_layer(masses: dict[str, FoundMass]) -> Layer:
-    """Masses' centres, as balls that hold the true ones with 95 % or more, and their figures as features.
+def centres_layers(masses: Mapping[str, FoundMass]) -> Iterator[Layer]:
+    """Masses' centres, as balls that hold the true ones with 95 % or more; as crosses where that isn't known.
 
-    A ball's radius is 1.96 times the root of the covariance's trace: 95 % if all errors are along one line, more else.
+    A ball's radius is 1.96 times the root of the covariance's trace: 95 % if all errors are along one line, more else. The
+    masses' figures are features.
     """
+    sigmas = {name: float(mass.figures.get("centre_sigma_mm") or np.nan) for name, mass in masses.items()}
+    known = {name: mass for name, mass in masses.items() if sigmas[name] > 0}
+    unknown = {name: mass for name, mass in masses.items() if name not in known}
+    if known:
+        size = [2 * NINETY_FIVE * sigmas[name] for name in known]
+        yield _centres(known, "centres, 95 %", {"size": size, "face_color": "cyan", "opacity": 0.6})
+    if unknown:
+        yield _centres(unknown, "centres, uncertainty unknown", {"size": MARK_MM, "face_color": "magenta", "symbol": "x"})
+
+
+def _centres(masses: Mapping[str, FoundMass], name: str, looks: dict[str, Any]) -> Layer:
     centres = np.array([mass.mesh.center_mass for mass in masses.values()])[:, ::-1]
-    size = [2 * NINETY_FIVE * float(mass.figures.get("centre_sigma_mm") or 0.0) for mass in masses.values()]
-    names = sorted(set.intersection(*(set(mass.figures) for mass in masses.values())))
-    told = {"mass": list(masses), **{name: [mass.figures[name] for mass in masses.values()] for name in names}}
-    looks = {"face_color": "cyan", "opacity": 0.6, "text": "{mass}"}
-    return centres, {"name": "centres, 95 %", "size": np.maximum(size, LEAST_MM), "features": told, **looks}, "points"
+    shared = sorted(set.intersection(*(set(mass.figures) for mass in masses.values())))
+    told = {"mass": list(masses), **{figure: [mass.figures[figure] for mass in masses.values()] for figure in shared}}
+    return centres, {"name": name, "features": told, "text": "{mass}", **looks}, "points"

@@ -25,6 +25,7 @@ from recon.reports import page
 from twin.evaluation import benchmark_results
 
 DRAWS = 2000  # of the bootstrap
+FEWEST = 5  # sessions of an interval
 HEAD = ("task", "figure", "sessions", "missing", "mean", "low95", "high95", "median")
 
 
@@ -47,9 +48,11 @@ def run(config: Config) -> None:
     names = sessions(config.truth)
     if not config.results.is_dir():
         raise InputError(f"{config.results}: expected a folder with results of sessions, found none")
-    for one in sorted(config.results.iterdir()):
+    for one in sorted(path for path in config.results.iterdir() if not path.name.startswith(".")):
         if one.name not in names:
             raise InputError(f"{one}: expected the name of a session, found none of them{did_you_mean(one.name, names)}")
+        if not one.is_dir():
+            raise InputError(f"{one}: expected a folder with a session's results, found a file")
     found = {name: benchmark_results.score(_task(name), config.results / name, config.truth / name) for name in names}
     rows = summary(found)
     with atomic.new_folder(config.out, "score-benchmark") as folder:
@@ -84,7 +87,8 @@ def summary(found: dict[str, Metrics]) -> list[tuple[str, ...]]:
             numbers = [np.nan] * 4
             if len(there):
                 draws = np.random.default_rng(0).choice(there, (DRAWS, len(there))).mean(axis=1)
-                numbers = [there.mean(), *np.quantile(draws, (0.025, 0.975)), np.median(there)]
+                interval = np.quantile(draws, (0.025, 0.975)) if len(there) >= FEWEST else (np.nan, np.nan)
+                numbers = [there.mean(), *interval, np.median(there)]
             texts = (shown(float(number), ".4g") for number in numbers)
             rows.append((task, figure, str(len(values)), str(len(values) - len(there)), *texts))
     return rows
@@ -106,7 +110,10 @@ def _page(title: str, rows: list[tuple[str, ...]], found: dict[str, Metrics]) ->
     opening = page.Opening(
         "open benchmark", title, f"Results of {here} of {len(found)} sessions.", [("sessions", str(len(found)), "")]
     )
-    caption = "Mean over sessions, its 95 % interval by a bootstrap over sessions, median. Missing results count in no figure."
+    caption = (
+        f"Mean over sessions, its 95 % interval by a bootstrap over sessions, of {FEWEST} or more, median. "
+        "Missing results count in no figure."
+    )
     absent = [name for name, figures in found.items() if not figures]
     sections = [page.Section("Scores", [page.table(HEAD, rows, caption)])]
     if absent:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -9,12 +10,15 @@ import pytest
 import trimesh
 
 from recon.capture import calibration_files, sweep_tables
+from recon.errors import InputError
+from recon.files.volumes import Volume
 from recon.geometry.camera import Camera
 from recon.model.calibration import Calibration
 from recon.model.tracks import Track
 from sonotwin import benchmark_sessions
 from sonotwin.choices import read_rig
 from sonotwin.cli import main
+from sonotwin.verbs import score_benchmark
 from twin.engine import Engine, results
 from twin.evaluation import benchmark_results
 from twin.evaluation.surface_errors import Truth
@@ -137,6 +141,42 @@ def test_another_round_is_kept(tmp_path):
     described = (tmp_path / "round/benchmark.json").read_text(encoding="utf-8")
     assert "secret" not in described and json.loads(described)["seed_sha256"] == benchmark_sessions.commitment("secret")
     assert main(["render-benchmark", f"out={tmp_path / 'round'}", "seed=other", "sessions=3"]) == 2
+
+
+def test_a_killed_run_is_finished_and_a_truth_stays_as_it_was_committed(tmp_path, monkeypatch):
+    """What it left behind is cleared; a truth that was edited since is refused, and so is another version's round."""
+    out, name = tmp_path / "round", "000000-optics"
+    assert benchmark_sessions.missing(out, "seed", 1) == [0]
+    (out / ".making" / name / "capture").mkdir(parents=True)
+    for part in ("sessions", "truth"):
+        (out / part / name).mkdir(parents=True)
+    (out / "truth" / name / "a.txt").write_text("1", encoding="utf-8")
+    benchmark_sessions.finish(out, "seed", 1)
+    assert not (out / ".making").exists() and benchmark_sessions.missing(out, "seed", 1) == []
+    (out / "truth" / name / "a.txt").write_text("2", encoding="utf-8")
+    with pytest.raises(InputError, match="was it edited"):
+        benchmark_sessions.finish(out, "seed", 1)
+    monkeypatch.setattr(benchmark_sessions, "code", lambda: "another")
+    with pytest.raises(InputError, match=r"benchmark\.json: code_sha256: expected another"):
+        benchmark_sessions.missing(out, "seed", 1)
+
+
+def test_a_neighbour_is_no_tissue(monkeypatch):
+    """The levels of two masses 1.5 mm apart tell them from tissue without a fault, if they are the true ones."""
+    balls = [trimesh.creation.icosphere(radius=4).apply_translation((9.5 * k, 0, 0)) for k in range(2)]
+    grid = np.arange(-12, 22, 0.5)
+    places = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
+    dark = np.min([np.linalg.norm(places - ball.center_mass, axis=-1) for ball in balls], axis=0) < 4
+    voxels = np.where(dark, 10, 100).astype(np.uint8).transpose(2, 1, 0)
+    volume = Volume(np.ascontiguousarray(voxels), np.full(3, -12.0), np.full(3, 0.5))
+    monkeypatch.setattr(benchmark_results, "passed", lambda drawn, _: np.ones(len(drawn), bool))
+    expected = SimpleNamespace(hidden=[SimpleNamespace(mesh=ball) for ball in balls])
+    assert benchmark_results.volume_figures(volume, expected)["volume_auc"] == pytest.approx(1, abs=1e-3)
+
+
+def test_few_sessions_have_no_interval():
+    rows = score_benchmark.summary({f"{k:06d}-optics": {"points_rms_mm": float(k)} for k in (0, 4, 8, 12)})
+    assert rows[0][4:] == ("6", "unknown", "unknown", "6")
 
 
 @pytest.mark.slow

@@ -168,7 +168,9 @@ def volume_figures(volume: Volume, expected: sweep_errors.SweepTruth) -> Metrics
         low, high = thing.mesh.bounds
         drawn = np.random.default_rng(number).uniform(low - SHELL_MM, high + SHELL_MM, (POINTS, 3))
         depth = signed_distances(drawn, thing.mesh)
-        chosen = passed(drawn, expected) & (np.abs(depth) > EDGE_MM) & (depth < SHELL_MM)
+        others = [signed_distances(drawn, other.mesh) for other in expected.hidden if other is not thing]
+        alone = np.min([np.full(POINTS, np.inf), *others], axis=0) > EDGE_MM
+        chosen = passed(drawn, expected) & (np.abs(depth) > EDGE_MM) & (depth < SHELL_MM) & alone
         places, inside = drawn[chosen], depth[chosen] < 0
         if not (inside.any() and (~inside).any()):
             continue

@@ -160,7 +160,6 @@ def needle_errors(settings: Settings, planned: Planned, number: int, key: list[i
     mass = np.add(where.place(*drawn_session.MIDDLE_MM), (0.0, 0.0, DEEP_MM))
     poses, tip, shafts = held(mass, target_of(settings.rig), rng, count)
     size = skill(hand, rng)
-    # the same numbers whatever the levels are
     aimed, bent, moved = rng.standard_normal((count, 3)), rng.standard_normal((count, 3)), rng.standard_normal(3)
     pushed, late, moments = np.abs(rng.standard_normal(count)), rng.standard_normal(count), rng.uniform(-0.5, 0.5, count)
     beats, high = rng.uniform(0, 1, count), float(np.exp(0.3 * rng.standard_normal()))  # of breath's height; assumed

@@ -37,7 +37,8 @@ class Share(NamedTuple):
     value: float
     low: float
     high: float
-    trials: int
+    trials: int  # that gave figures
+    refused: int = 0  # that gave none
 
 
 def share(hits: Array, units: Array) -> Share:
@@ -62,17 +63,18 @@ def wilson(value: float, count: float) -> tuple[float, float]:
 
 def by_level(wanted: Shares, done: Sequence[Done]) -> Iterator[tuple[str, Any, dict[str, Share]]]:
     """Factor, level and shares of all counts: of all trials first ("", ""), then of each level of each factor that varies."""
-    here = [one for one in done if not one.failed]
-    yield "", "", _shares(wanted, here)
+    yield "", "", _shares(wanted, done)
     for field in done[0].trial.point if done else ():
         levels = list(dict.fromkeys(cell(one.trial.point[field]) for one in done))
         for level in levels if len(levels) > 1 else ():
-            yield field, level, _shares(wanted, [one for one in here if cell(one.trial.point[field]) == level])
+            yield field, level, _shares(wanted, [one for one in done if cell(one.trial.point[field]) == level])
 
 
 def _shares(wanted: Shares, done: Sequence[Done]) -> dict[str, Share]:
-    units = np.array([one.figures[wanted.of] for one in done], float)
-    return {name: share(np.array([one.figures[name] for one in done], float), units) for name in wanted.counts}
+    here = [one for one in done if not one.failed]
+    units, refused = np.array([one.figures[wanted.of] for one in here], float), len(done) - len(here)
+    found = {name: share(np.array([one.figures[name] for one in here], float), units) for name in wanted.counts}
+    return {name: one._replace(refused=refused) for name, one in found.items()}
 
 
 def parts(wanted: Shares, done: Sequence[Done]) -> Sum:

@@ -26,9 +26,16 @@ def sections(folder: Path, wanted: Shares, done: Sequence[Done]) -> list[Section
     drawing = kept_drawing(
         folder, "shares.png", draw(wanted, levels), f"Shares with {CONFIDENCE:.0%} intervals", "The unit is the patient."
     )
-    head = ["", "patients", *(f"{text}, %" for text in wanted.counts.values())]
-    rows = [[_name(level), str(next(iter(level[2].values())).trials), *map(in_words, level[2].values())] for level in levels]
-    caption = f"In brackets: Wilson's intervals of {CONFIDENCE:.0%}, with what counts of one patient have in common."
+    head = ["", "patients", "refused", *(f"{text}, %" for text in wanted.counts.values())]
+    rows = [
+        [_name(level), str(any_of.trials), str(any_of.refused), *map(in_words, level[2].values())]
+        for level in levels
+        for any_of in [next(iter(level[2].values()))]
+    ]
+    caption = (
+        f"In brackets: Wilson's intervals of {CONFIDENCE:.0%}, with what counts of one patient have in common. Refused patients, "
+        "such as those whose target was lost, have no plan and count in no share."
+    )
     one = shares.parts(wanted, done)
     made = [Section("Shares", [drawing, page.table(head, rows, caption)])]
     if wanted.without:

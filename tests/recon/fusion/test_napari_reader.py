@@ -15,6 +15,7 @@ from recon.files import meshes, metrics, volumes
 from recon.files.volumes import Volume
 from recon.fusion import napari_reader
 
+CENTRES = ("centres, 95 %", "centres, uncertainty unknown")
 TURNED = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 FIGURES = {"mass0_volume_mm3": 500.0, "mass0_centre_sigma_mm": 0.2, "mass1_volume_mm3": 60.0}
 
@@ -49,7 +50,7 @@ def test_all_results_are_layers_in_the_world(result):
     found = layers(result)
     kinds = {name: kind for name, (_, _, kind) in found.items()}
     surfaces = dict.fromkeys(("surface", "mass0", "mass1"), "surface")
-    assert kinds == {"volume": "image", **surfaces, "centres, 95 %": "points", "left out": "points"}
+    assert kinds == {"volume": "image", **surfaces, **dict.fromkeys((*CENTRES, "left out"), "points")}
     voxels, told, _ = found["volume"]
     index = np.array([1, 2, 3])  # z, y, x
     place = (told["affine"] @ np.append(index, 1))[:3][::-1]
@@ -61,11 +62,15 @@ def test_all_results_are_layers_in_the_world(result):
 
 
 def test_centres_are_as_large_as_they_are_uncertain(result):
-    """By 1.96 sigma as radius; figures that all masses have are features."""
-    centres, told, _ = layers(result)["centres, 95 %"]
-    assert centres == pytest.approx(np.array([[30, 20, 10], [60, -5, 0]]), abs=1e-5)
-    assert told["size"] == pytest.approx([2 * 1.96 * 0.2, napari_reader.LEAST_MM])
-    assert told["features"] == {"mass": ["mass0", "mass1"], "volume_mm3": [500.0, 60.0]}
+    """By 1.96 sigma as radius; a mass of unknown uncertainty stands apart."""
+    found = layers(result)
+    (centres, told, _), (others, without, _) = (found[name] for name in CENTRES)
+    assert centres == pytest.approx(np.array([[30, 20, 10]]), abs=1e-5) and others == pytest.approx(
+        np.array([[60, -5, 0]]), abs=1e-5
+    )
+    assert told["size"] == pytest.approx([2 * 1.96 * 0.2])
+    assert told["features"] == {"mass": ["mass0"], "volume_mm3": [500.0], "centre_sigma_mm": [0.2]}
+    assert without["features"] == {"mass": ["mass1"], "volume_mm3": [60.0]}, "an unknown sigma is no small one"
 
 
 def test_others_folders_are_left_to_others(tmp_path, result):
