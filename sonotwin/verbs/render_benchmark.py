@@ -3,7 +3,7 @@
 Writes OUT/sessions/NUMBER-TASK/, a session each of optics, tracking, surface, ultrasound in turn: images as PNG, tables as CSV,
 session.json; OUT/truth/, which only `sonotwin score-benchmark` opens; OUT/benchmark.json with the seed's SHA-256 and those of the
 truth; OUT/checksums.sha256. The seed is a text: a public one for practice, a secret one for a sealed round. The same seed
-gives the same bytes, whatever the workers. Takes 10 to 60 s of one core a session. A run that was
+gives the same bytes, whatever the workers. Takes some 10 to 60 s of one core a session. A run that was
 stopped goes on where it was when started again, also with more sessions. See docs/benchmark.md.
 
     sonotwin render-benchmark out=outputs/practice sessions=8
