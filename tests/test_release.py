@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -22,6 +24,8 @@ EXCEPTIONS = {  # by what their own texts say
     "pypylon": "BSD-3-Clause around Basler's own runtime, whose terms let one use it; only `live` brings it",
     "tqdm": "MPL-2.0 and MIT, unchanged; only Optuna's, of `study`",
 }
+
+ON_CONDA_FORGE = {"opencv-contrib-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}
 
 
 def declared(name: str) -> str:
@@ -66,3 +70,34 @@ def test_citations_agree_with_the_project():
     assert expected == tuple(zenodo[key] for key in ("title", "version", "license", "description", "creators"))
     rig = next(each for each in citation["references"] if each["notes"] == "the rig")
     assert [each["identifier"] for each in zenodo["related_identifiers"]] == [rig["doi"]]
+
+
+def test_the_conda_packages_require_what_the_project_does():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = yaml.safe_load((ROOT / ".ci/conda/recipe.yaml").read_text(encoding="utf-8"))
+    core, twin = (conda_requirements(output) for output in recipe["outputs"])
+    assert (str(core.pop("python")), recipe["context"]["version"]) == (project["requires-python"], project["version"])
+    assert core == pip_requirements(project["dependencies"])
+    assert twin == pip_requirements(project["optional-dependencies"]["twin"])
+    entry = recipe["outputs"][0]["build"]["python"]["entry_points"]
+    assert [each.split(" = ") for each in entry] == [list(each) for each in project["scripts"].items()]
+
+
+def conda_requirements(output) -> dict[str, SpecifierSet]:
+    lines = [line for line in output["requirements"]["run"] if not line.startswith("${{")]
+    return {name: SpecifierSet(versions) for name, _, versions in (line.partition(" ") for line in lines)}
+
+
+def pip_requirements(lines) -> dict[str, SpecifierSet]:
+    wanted = [Requirement(line) for line in lines]
+    return {ON_CONDA_FORGE.get(each.name, each.name): each.specifier for each in wanted}
+
+
+def test_the_image_has_a_python_that_the_project_runs_on_and_all_that_the_wheel_is_made_of():
+    python = re.search(r"^ARG PYTHON=(.+)$", (ROOT / "Dockerfile").read_text(encoding="utf-8"), flags=re.MULTILINE)[1]
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wheel, project = settings["tool"]["hatch"]["build"]["targets"]["wheel"], settings["project"]
+    assert python in SpecifierSet(project["requires-python"])
+    made_of = {*wheel["packages"], *wheel["force-include"], project["readme"], *project["license-files"], "pyproject.toml"}
+    sent = {line[1:] for line in (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines() if line.startswith("!")}
+    assert made_of | {"constraints.txt"} == sent
