@@ -97,13 +97,13 @@ def from_scans(
     for times in REFINEMENTS:
         if masses:
             power = cleared(recording, grid, masses, sound)
-            masses, shadows = _without_shadows(masses, power)
+            masses, shadows = _without_shadows(masses, power, with_shadows)
             masses, left_out = refined(masses, power, times), left_out + shadows
     more = faint(power, masses, begun) if even else Found([], [])
     left_out += more.left_out
     if more.masses:
         power = cleared(recording, grid, [*masses, *refined(more.masses, power, REFINEMENTS[0])], sound)
-        masses, shadows = _without_shadows(masses, power)
+        masses, shadows = _without_shadows(masses, power, with_shadows)
         left_out += shadows
         masses += refined(more.masses, power, sum(REFINEMENTS))
     masses, hidden = _with_backs(recording, grid, masses, power, with_shadows, sound)
@@ -193,15 +193,15 @@ def tissue_grey(images: Iterable[NDArray], shape: tuple[int, int], world_from_pi
     return grey
 
 
-def _without_shadows(masses: Sequence[Mass], power: EchoPower) -> tuple[list[Mass], list[LeftOut]]:
-    """Masses but for dark ones that aren't dark any more, or aren't seen, in power without the shadows of others; and these."""
+def _without_shadows(masses: Sequence[Mass], power: EchoPower, with_shadows: EchoPower) -> tuple[list[Mass], list[LeftOut]]:
+    """Masses but for dark ones that, in power without the shadows of others, aren't dark or are hardly seen; and these."""
     kept, left_out = list[Mass](), list[LeftOut]()
     for mass in masses:
         values = _sampled(power, _core(mass))
-        seen = np.isfinite(values)
+        seen, scanned = np.isfinite(values), np.isfinite(_sampled(with_shadows, _core(mass)))
         if mass.bright:
             kept.append(mass)
-        elif seen.mean() <= LIMITS.least_seen:
+        elif seen.mean() <= LIMITS.least_seen * scanned.mean():  # B-scans far apart pass by most of a mass anyway
             why = "too little sound comes there through masses before it"
             left_out.append(_left_out("in the shadow of a mass", mass, power, why))
         elif np.median(values[seen]) >= LIMITS.still:

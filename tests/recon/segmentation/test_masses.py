@@ -183,6 +183,19 @@ def test_a_hand_that_goes_up_and_down_leaves_no_gap(rng, caplog):
     assert len(find(power)) == 1 and not caplog.messages
 
 
+def test_b_scans_far_apart_pass_by_a_mass_and_shadows_hide_it(rng):
+    """A quarter of its slices is scanned; in the shadow of others a fifth of these stay."""
+    power = speckled(ball()[0], rng)
+    (mass,) = find(power)
+    slices = np.arange(SIZE[2])
+    power.weight[slices % 4 > 0] = 0
+    kept, left_out = masses._without_shadows([mass], power, power)
+    assert kept == [mass] and not left_out
+    shaded = EchoPower(power.volume, np.where((slices % 20 == 0)[:, None, None], power.weight, 0))
+    kept, left_out = masses._without_shadows([mass], shaded, power)
+    assert not kept and [one.reason for one in left_out] == ["in the shadow of a mass"]
+
+
 @pytest.mark.parametrize("share", [0.35, 0.8])
 def test_a_body_that_the_images_lower_end_cuts_asks_for_depth(share, rng, caplog):
     last = int(((CENTRE - ORIGIN)[1] + (2 * share - 1) * RADIUS) / SPACING[1])
