@@ -22,7 +22,8 @@ from recon.geometry import rigid
 from recon.segmentation.mass_files import FoundMass
 
 MARKUPS, LEFT_OUT, TRANSFORM = "masses.mrk.json", "left_out.mrk.json", "target_to_world.tfm"
-SCRIPT, README = "show.py", "README.txt"
+SCRIPT, README, SEARCH = "show.py", "README.txt", "search.txt"
+NINETY_FIVE = 1.96
 TEMPLATES = Path(__file__).parent
 
 
@@ -51,6 +52,7 @@ def write(folder: Path, scene: FusedScene, voxels: Mapping[str, Path], scans: in
     shutil.copyfile(TEMPLATES / f"slicer_{SCRIPT}.txt", folder / SCRIPT)
     told = (TEMPLATES / f"slicer_{README}.txt").read_text(encoding="utf-8")
     (folder / README).write_text(f"{told}\n{scene.search}\n", encoding="utf-8")
+    (folder / SEARCH).write_text(f"{scene.search}\n", encoding="utf-8")
 
 
 def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
@@ -59,7 +61,11 @@ def _models(scene: FusedScene) -> Iterator[tuple[str, trimesh.Trimesh]]:
         yield "skin", scene.skin
     if scene.rest is not None:
         yield "table", merged(scene.rest, STEP_MM)
-    yield from ((name, mass.mesh) for name, mass in (scene.masses or {}).items())
+    for name, mass in (scene.masses or {}).items():
+        yield name, mass.mesh
+        if (sigma := mass.figures.get("centre_sigma_mm", np.nan)) > 0:
+            ball = trimesh.creation.icosphere(radius=NINETY_FIVE * sigma)
+            yield f"centre_{name}", ball.apply_translation(mass.mesh.center_mass)
     if scene.seen is not None and scene.seen.unseen is not None:
         yield "unseen", scene.seen.unseen
     if len(scene.path):
