@@ -82,23 +82,28 @@ def evaluate(model: Model, inputs: Sequence[Input], rng: np.random.Generator, dr
     Sources: JCGM 100:2008, 5.1 (sensitivities by differences over one standard uncertainty to both sides, 5.1.3 note 2), G.4
     (effective degrees of freedom); JCGM 101:2008, 6.4 (distributions) and 7 (draws).
     """
-    values = {one.name: np.array([one.value]) for one in inputs}
-    value, rows = float(model(values)[0]), []
+    value, slopes = linearize(model, inputs)
+    variances = np.array([(slope * one.standard) ** 2 for one, slope in zip(inputs, slopes, strict=True)])
+    total = float(variances.sum())
+    finite = sum(part**2 / one.freedom for part, one in zip(variances, inputs, strict=True))
+    freedom = total**2 / finite if finite > 0 else np.inf
+    drawn = model({one.name: _draw(one, rng, draws) for one in inputs})
+    low, high = np.quantile(drawn, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
+    shares = variances / total if total > 0 else np.zeros(len(inputs))
+    lines = tuple(Row(one, slope, float(share)) for one, slope, share in zip(inputs, slopes, shares, strict=True))
+    k = float(stats.t.ppf((1 + COVERAGE) / 2, freedom))
+    return Budget(value, lines, float(np.sqrt(total)), float(freedom), k, (float(low), float(high)))
+
+
+def linearize(model: Model, inputs: Sequence[Input]) -> tuple[float, list[float]]:
+    """A test value, and its sensitivity to each input."""
+    values, slopes = {one.name: np.array([one.value]) for one in inputs}, list[float]()
     for one in inputs:
         step = one.standard or 1e-6 * max(abs(one.value), 1.0)
         ends = one.value + step * np.array([-1.0, 1.0])
         low, high = model({**{name: np.repeat(there, 2) for name, there in values.items()}, one.name: ends})
-        rows.append((one, (high - low) / (2 * step)))
-    variances = np.array([(slope * one.standard) ** 2 for one, slope in rows])
-    total = float(variances.sum())
-    finite = sum(part**2 / one.freedom for part, (one, _) in zip(variances, rows, strict=True))
-    freedom = total**2 / finite if finite > 0 else np.inf
-    drawn = model({one.name: _draw(one, rng, draws) for one in inputs})
-    low, high = np.quantile(drawn, [(1 - COVERAGE) / 2, (1 + COVERAGE) / 2])
-    shares = variances / total if total > 0 else np.zeros(len(rows))
-    lines = tuple(Row(one, float(slope), float(share)) for (one, slope), share in zip(rows, shares, strict=True))
-    k = float(stats.t.ppf((1 + COVERAGE) / 2, freedom))
-    return Budget(value, lines, float(np.sqrt(total)), float(freedom), k, (float(low), float(high)))
+        slopes.append(float((high - low) / (2 * step)))
+    return float(model(values)[0]), slopes
 
 
 def _draw(one: Input, rng: np.random.Generator, draws: int) -> Array:

@@ -3,10 +3,14 @@
 The measurand of a test value is the rig's error of indication in that place: what another measurement there would show in the
 mean. So the noise of this one counts as uncertainty (type A), which ISO 14253-5 would leave out, where the error of this one
 measurement is meant; its share stands in each budget. Errors of the rig's calibration are what is tested, and no uncertainty.
+
+What a whole sequence shifts alike, such as a phase error of all fringes, shows where places are recorded again: the scatter of
+repeats beyond their own noise, pooled over all such places, is then an input (type A) of every value of that quantity.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from types import MappingProxyType
 from typing import NamedTuple
@@ -26,6 +30,7 @@ from recon.geometry.primitives import Plane, Sphere
 Array = NDArray[np.float64]
 
 REFERENCE_C = 20.0  # of certificates (ISO 1)
+SEQUENCE = "sequence: scatter of repeats beyond their noise"
 
 
 class Characteristic(NamedTuple):
@@ -47,6 +52,16 @@ CHARACTERISTICS = {
     "TP": Characteristic("repeatability of a tool’s tip in a divot, RMS", "", "tp_mm"),
     "TD": Characteristic("error of divots’ distance by a tool’s tip", "", "td_mm"),
 }
+
+
+class Test(NamedTuple):
+    """A quantity in one place, not judged yet."""
+
+    symbol: str  # of CHARACTERISTICS
+    place: str
+    points: int
+    model: gum_budget.Model
+    inputs: list[Input]
 
 
 class Measured(NamedTuple):
@@ -116,40 +131,81 @@ def judge(
     ValueError
         If points of a sphere lie in a plane.
     """
-    rng, values = np.random.default_rng(seed), list[Judged]()
-    middles: dict[str, list[Array]] = {}
+    rng, tests = np.random.default_rng(seed), list[Test]()
+    middles: dict[str, dict[str, Array]] = {"sphere": {}, "bar": {}, "plane": {}}
 
-    def add(test: str, place: str, points: int, model: gum_budget.Model, inputs: list[Input]) -> None:
-        budget, limit = gum_budget.evaluate(model, inputs, rng, draws), getattr(limits, CHARACTERISTICS[test].limit)
-        decision = None if limit is None else decide(budget.value_mm, budget.expanded_mm, limit)
-        values.append(Judged(test, place, points, budget, limit, decision))
+    def add(symbol: str, place: str, points: int, model: gum_budget.Model, inputs: list[Input]) -> None:
+        tests.append(Test(symbol, place, points, model, inputs))
 
-    def forms(tests: tuple[str, str], place: str, found: Probed[Sphere] | Probed[Plane], form_mm: float) -> None:
-        for test, width in zip(tests, (found.all, found.most), strict=True):
-            add(test, place, len(found.residuals), _form, form_inputs(width.mm, width.sigma_mm, form_mm))
+    def forms(symbols: tuple[str, str], place: str, found: Probed[Sphere] | Probed[Plane], form_mm: float) -> None:
+        for symbol, width in zip(symbols, (found.all, found.most), strict=True):
+            add(symbol, place, len(found.residuals), _form, form_inputs(width.mm, width.sigma_mm, form_mm))
 
     for place, points in measured.spheres.items():
         assert artefacts.sphere is not None
         found = probe_sphere(points, rng, repeats)
         forms(("PF", "PF95"), place, found, artefacts.sphere.form_mm)
         add("PS", place, len(points), _size, size_inputs(found, artefacts))
-        middles.setdefault("sphere", []).append(found.shape.centre)
+        middles["sphere"][place] = found.shape.centre
     for place, (first, second) in measured.bars.items():
         balls = probe_sphere(first, rng, 2), probe_sphere(second, rng, 2)
         count = len(first) + len(second)
         add("SD", place, count, _spacing, spacing_inputs(balls, artefacts))
         add("E", place, count, _length, length_inputs(balls, artefacts))
-        middles.setdefault("bar", []).append((balls[0].shape.centre + balls[1].shape.centre) / 2)
+        middles["bar"][place] = (balls[0].shape.centre + balls[1].shape.centre) / 2
     for place, points in measured.planes.items():
         assert artefacts.plane is not None
         found = probe_plane(points, rng, repeats)
         forms(("F", "F95"), place, found, artefacts.plane.form_mm)
-        middles.setdefault("plane", []).append(points.mean(axis=0))
+        middles["plane"][place] = points.mean(axis=0)
     _judge_tool(measured.divots, artefacts, add)
-    order = {test: number for number, test in enumerate(CHARACTERISTICS)}
-    values.sort(key=lambda one: order[one.symbol])
-    placed = {kind: np.array(found) for kind, found in middles.items()}
+    values = list[Judged]()
+    for symbol, quantity in CHARACTERISTICS.items():
+        limit = getattr(limits, quantity.limit)
+        for test in with_repeats([test for test in tests if test.symbol == symbol]):
+            budget = gum_budget.evaluate(test.model, test.inputs, rng, draws)
+            decision = None if limit is None else decide(budget.value_mm, budget.expanded_mm, limit)
+            values.append(Judged(symbol, test.place, test.points, budget, limit, decision))
+    placed = {
+        kind: np.array([middle for place, middle in own.items() if place_of(place, own) == place])
+        for kind, own in middles.items()
+        if own
+    }
     return Acceptance(tuple(values), tuple(prescribed_places.demands(artefacts, placed)), placed)
+
+
+def place_of(name: str, names: Collection[str]) -> str:
+    """The place that a recording repeats, `sphere/03` of `sphere/03-again` if that is among the names; else its own name."""
+    first = name.partition("-")[0]
+    return first if first in names else name
+
+
+def with_repeats(tests: Sequence[Test]) -> list[Test]:
+    """Tests of one quantity, where places were recorded again with the scatter of sequences as one more input.
+
+    That is the variance of repeats about their places' means, pooled, less their own noise; with the former's degrees of freedom.
+    """
+    found = [gum_budget.linearize(test.model, test.inputs) for test in tests]
+    names, groups = {test.place for test in tests}, dict[str, list[int]]()
+    for number, test in enumerate(tests):
+        if not test.place.startswith("divots"):  # where another tilt of the tool has another name
+            groups.setdefault(place_of(test.place, names), []).append(number)
+    repeated = [own for own in groups.values() if len(own) > 1]
+    if not repeated:
+        return list(tests)
+    freedom = sum(len(own) - 1 for own in repeated)
+    scatter = sum(np.var([found[k][0] for k in own]) * len(own) for own in repeated) / freedom
+    noise = [
+        sum((slope * one.standard) ** 2 for one, slope in zip(tests[k].inputs, found[k][1], strict=True) if one.kind == "A")
+        for own in repeated
+        for k in own
+    ]
+    beyond = Input(SEQUENCE, 0.0, float(np.sqrt(max(scatter - np.mean(noise), 0.0))), "A", freedom=freedom)
+    return [test._replace(model=partial(_shifted, test.model), inputs=[*test.inputs, beyond]) for test in tests]
+
+
+def _shifted(model: gum_budget.Model, x: Mapping[str, Array]) -> Array:
+    return model(x) + x[SEQUENCE]
 
 
 def divot_number(place: str) -> tuple[int, bool]:

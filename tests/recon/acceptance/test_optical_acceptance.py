@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from recon.acceptance import certificate_page, certificate_sheet, optical_acceptance, prescribed_places
+from recon.acceptance import certificate_page, certificate_sheet, gum_budget, optical_acceptance, prescribed_places
 from recon.acceptance.certificate_page import Subject
 from recon.acceptance.certificates import Artefacts, BallCertificate, BarCertificate, Certified, PlateCertificate
 from recon.acceptance.conformity import Limits
+from recon.acceptance.gum_budget import Input
 from recon.acceptance.optical_acceptance import Measured
 from tests.recon.acceptance import drawn_surfaces
 
@@ -134,3 +136,36 @@ def test_the_page_and_the_sheet_say_the_same(rng, tmp_path):
         assert words.replace(" mm", "") in html.replace("\u00a0", " ") and words.replace("−", "-") in text
         assert f"{symbol} at {one.place}" in text and "share of variance" in text
     assert "signature" in text and "2026-12-01" in text
+
+
+def test_repeats_tell_what_a_sequence_shifts_alike(rng):
+    """Sizes with shifts of 0.02 mm a sequence, noise of 0.01 mm: 95 % of the intervals hold the mean, 62 % without repeats.
+
+    1200 tests of three recordings in each of four places; of such shares 0.6 % is a standard deviation, if all were independent.
+    """
+    held = {True: [], False: []}
+    for _ in range(100):
+        errors = np.hypot(0.02, 0.01) * rng.standard_normal((4, 3))
+        tests = [
+            optical_acceptance.Test("PS", f"sphere/0{place}{'-again' * again}", 100, lambda x: x["size"],
+                                    [Input("size", error, 0.01, "A")])
+            for place, own in enumerate(errors) for again, error in enumerate(own)
+        ]  # fmt: skip
+        for repeats, own in ((True, optical_acceptance.with_repeats(tests)), (False, tests)):
+            budgets = [gum_budget.evaluate(test.model, test.inputs, rng, draws=2000) for test in own]
+            held[repeats] += [abs(one.value_mm) <= one.expanded_mm for one in budgets]
+    assert np.mean(held[True]) == pytest.approx(0.95, abs=0.025)
+    assert np.mean(held[False]) == pytest.approx(2 * stats.norm.cdf(1.96 * 0.01 / np.hypot(0.02, 0.01)) - 1, abs=0.05)
+
+
+def test_a_repeat_is_no_place(rng):
+    """It counts for the scatter, in all values of its quantity, and for no demand on the arrangement."""
+    points = measured(rng, places=3)
+    again = drawn_surfaces.ball(prescribed_places.spheres(ARTEFACTS.volume, DIAMETER)[0], DIAMETER * WARM / 2 + 0.05, rng, SIGMA)
+    found = judged(points._replace(spheres={**points.spheres, "sphere/00-again": again}))
+    assert len(found.middles["sphere"]) == 3
+    inputs = {one.symbol: [row.input.name for row in one.budget.rows] for one in found.values}
+    assert optical_acceptance.SEQUENCE in inputs["PS"] and optical_acceptance.SEQUENCE not in inputs["SD"]
+    own = [one.budget.rows[-1].input for one in found.values if one.symbol == "PS"]
+    assert len(set(own)) == 1 and own[0].freedom == 1
+    assert own[0].standard == pytest.approx(0.08 / np.sqrt(2), rel=0.1)
