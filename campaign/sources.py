@@ -143,6 +143,8 @@ COMMANDS = (
             ("balls",), tuple(f"balls/sphere/00/{name.removeprefix('ball/')}" for name in BALL)),
     Command("certify", ("capture=tool", "artefacts=divots.yaml", "tip=small_tip.yaml"), ("tool", "divots.yaml", "small_tip.yaml"),
             ("tool/divots/01.csv", "divots.yaml", "small_tip.yaml")),
+    Command("certify", ("capture=scanner", "artefacts=filaments.yaml"), ("scanner", "filaments.yaml"),
+            ("scanner/filaments/00/1.png", "filaments.yaml")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),
@@ -363,7 +365,10 @@ def _write_small_ones(folder: Path) -> None:
 
 
 def _write_tool(folder: Path) -> None:
-    """Poses of a needle that pivots in a dimple, and in two divots, its mesh, a tip's file, and certificates of artefacts."""
+    """Poses of a needle that pivots in a dimple, and in two divots, its mesh, its tip, B-scans of filaments, and certificates."""
+    import json
+
+    import cv2
     import trimesh
 
     rng, length = np.random.default_rng(0), 150.0
@@ -375,6 +380,17 @@ def _write_tool(folder: Path) -> None:
         moved = rigid.transform(np.eye(3), (aside_mm, 0, 0)) @ poses
         sweep_tables.write_track(folder / f"tool/divots/{k:02d}.csv", pivot_films.tracked(moved, rng))
     (folder / "divots.yaml").write_text("divots: {places_mm: [[0, 0, 0], [80, 0, 0]], expanded_mm: 0.02}\n", encoding="utf-8")
+    places = ((2.0, 5.0), (2.0, 10.0), (7.0, 8.0))
+    (folder / "scanner/filaments/00").mkdir(parents=True, exist_ok=True)
+    for k in range(3):
+        image = rng.integers(20, 40, (140, 90), dtype=np.uint8)
+        for x, y in places:
+            image[int(10 * y) + k, int(10 * x) + 2 * k] = 250
+        cv2.imwrite(str(folder / f"scanner/filaments/00/{k}.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
+    screen = "{mm_per_px: [0.1, 0.1]}"
+    (folder / "filaments.yaml").write_text(
+        f"filaments: {{places_mm: {json.dumps(places)}, expanded_mm: 0.02, screen: {screen}}}\n", encoding="utf-8"
+    )
     (folder / "upright.yaml").write_text("plane: {size_mm: [180, 60], form_mm: 0.002}\n", encoding="utf-8")
     mesh = trimesh.creation.cone(1.0, length, sections=6).apply_transform(np.diag([1.0, -1, -1, 1]))
     for suffix in (".stl", ".glb"):

@@ -79,7 +79,7 @@ def plate(points: Array, name: str, rng: np.random.Generator, region: Region = R
 
 def expected(artefacts: Artefacts) -> tuple[str, ...]:
     """Names of the folders of an acceptance test, by the artefacts that there are."""
-    return tuple(kind for kind in ("sphere", "bar", "plane", "divots") if getattr(artefacts, kind) is not None)
+    return tuple(kind for kind in ("sphere", "bar", "plane", "divots", "filaments") if getattr(artefacts, kind) is not None)
 
 
 def _within(points: Array, border_mm: float) -> Array:

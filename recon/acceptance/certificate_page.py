@@ -20,8 +20,8 @@ READING = (
     "A test value is the rig’s error of indication in one place: what another measurement there would show in the mean. U "
     "is its expanded uncertainty for 95 %: certificates, temperature, paint, mounting, and the noise of this measurement, "
     "which ISO 14253-5 would leave out. Errors of the rig’s calibration are what is tested, and are not in U. What a whole "
-    "sequence shifts alike, such as an error of a fringe’s phase, one sequence in a place does not show: it is in the "
-    "values, not in U.",
+    "sequence shifts alike, such as an error of a fringe’s phase, is in U where places were recorded again, for quantities of "
+    "these artefacts; one sequence in each place does not show it: then it is in the values alone.",
     "Decisions are by ISO 14253-1: accepted where |error| + U is within the limit, rejected where |error| - U is beyond it; "
     "between them neither is proven. A quantity is accepted where it is in all its places, the rig where all quantities "
     "are.",
@@ -33,6 +33,9 @@ READING = (
     "TP is the distance of a tracked tool’s tip from its mean in a divot, root mean square, with the tool at rest or turned; "
     "TD the distance of the tip’s means in two divots less the certified one: tests of ASTM F2554 in kind. An error of the "
     "tip’s calibration counts as the tool’s.",
+    "UD is the distance of two filaments of a phantom in B-scans, with depths as of the phantom’s speed of sound, less the "
+    "certified one; UL and UA are widths of a filament’s echo at -6 dB, along the array and in depth: tests of IEC 61391-1 in "
+    "kind. Each is the mean of several B-scans, for each of which the probe was placed again.",
     "The guidelines are sold, not public. Quantities, numbers of places and sizes of artefacts are as publicly described; "
     "the exact arrangements, and what ISO 10360-13 has beside them (registered views, lengths between points, rules for "
     "repeats), are not reproduced. E is ours: a view from one side does not see a bar’s outer ends.",
@@ -150,6 +153,11 @@ def artefact_rows(artefacts: Artefacts) -> list[tuple[str, str, str]]:
     if artefacts.divots is not None:
         expanded = _certified(artefacts.divots.expanded_mm, artefacts.divots.k)
         rows += [("divots, distance of two", f"{len(artefacts.divots.places_mm)} places", expanded)]
+    if artefacts.filaments is not None:
+        phantom = artefacts.filaments
+        expanded = _certified(phantom.expanded_mm, phantom.k)
+        rows += [("filaments, distance of two", f"{len(phantom.places_mm)} places", expanded)]
+        rows += [("phantom, speed of sound", f"{phantom.speed_m_s:g} m/s", f"± {phantom.speed_limit_m_s:g} m/s")]
     return rows
 
 

@@ -85,6 +85,41 @@ class DivotCertificate(Material):
         return Certified(mm=float(apart), expanded_mm=self.expanded_mm, k=self.k)
 
 
+class Screen(Part):
+    """How a scanner shows its B-scans."""
+
+    mm_per_px: tuple[Positive, Positive] = (0.1229, 0.1225)
+    """mm a pixel, along the array and in depth, by the scanner's own scale"""
+    assumed_m_s: Positive = 1540.0
+    """m/s, speed of sound by which it shows depths"""
+    dynamic_range_db: Positive = 60.0
+    """dB from black to white, greys being even in dB"""
+    dynamic_range_limit_db: NotNegative = 3.0
+    """dB, half the width of the interval that holds it"""
+
+
+class FilamentCertificate(Part):
+    """An ultrasound phantom with parallel filaments, which the image's plane crosses squarely."""
+
+    places_mm: Annotated[tuple[tuple[Finite, Finite], ...], Field(min_length=3)]
+    """mm, each filament across all of them: along the phantom's face, and below it; filaments are numbered from 0"""
+    expanded_mm: NotNegative
+    """mm, expanded uncertainty U of a distance of two of them"""
+    k: Annotated[float, Field(ge=1, le=4)] = 2.0
+    """coverage factor of U"""
+    speed_m_s: Annotated[float, Field(ge=1300, le=1800)] = 1540.0
+    """m/s, of sound in the phantom at the room's temperature"""
+    speed_limit_m_s: NotNegative = 5.0
+    """m/s, half the width of the interval that holds it"""
+    screen: Screen = Screen()
+    """of the scanner, as it is set"""
+
+    def distance(self, first: int, second: int) -> Certified:
+        """Distance of two filaments."""
+        apart = np.linalg.norm(np.subtract(self.places_mm[second], self.places_mm[first]))
+        return Certified(mm=float(apart), expanded_mm=self.expanded_mm, k=self.k)
+
+
 class Volume(Part):
     """The measuring volume, a box along the world's axes, that the rig is specified for."""
 
@@ -116,6 +151,8 @@ class Artefacts(Part):
     """null: no test of flatness"""
     divots: DivotCertificate | None = None
     """null: no tests of a tracked tool"""
+    filaments: FilamentCertificate | None = None
+    """null: no tests of the scanner"""
 
     @model_validator(mode="after")
     def _can_be(self) -> "Artefacts":
@@ -124,14 +161,15 @@ class Artefacts(Part):
             raise ValueError(f"bar.length.mm: expected more than its balls' diameters, found {bar.length.mm:g}")
         if bar is not None and bar.rod_mm >= min(ball.mm for ball in bar.diameters):
             raise ValueError(f"bar.rod_mm: expected less than its balls' diameters, found {bar.rod_mm:g}")
-        if self.divots is not None:
-            places = np.array(self.divots.places_mm)
-            apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + np.diag(np.full(len(places), np.inf))
-            if not apart.min() > 0:
-                first, second = np.unravel_index(apart.argmin(), apart.shape)
-                raise ValueError(
-                    f"divots.places_mm: expected places apart from each other, found {first} and {second} in one place"
-                )
-        if self.sphere is None and bar is None and self.plane is None and self.divots is None:
-            raise ValueError("expected sphere, bar, plane or divots, found none of them")
+        for name, body in (("divots", self.divots), ("filaments", self.filaments)):
+            if body is not None:
+                places = np.array(body.places_mm)
+                apart = np.linalg.norm(places[:, None] - places[None], axis=-1) + np.diag(np.full(len(places), np.inf))
+                if not apart.min() > 0:
+                    first, second = np.unravel_index(apart.argmin(), apart.shape)
+                    raise ValueError(
+                        f"{name}.places_mm: expected places apart from each other, found {first} and {second} in one place"
+                    )
+        if not any((self.sphere, bar, self.plane, self.divots, self.filaments)):
+            raise ValueError("expected sphere, bar, plane, divots or filaments, found none of them")
         return self

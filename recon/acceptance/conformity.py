@@ -29,6 +29,12 @@ class Limits(Part):
     """TP, repeatability of a tracked tool's tip in a divot: distance from its mean, RMS"""
     td_mm: Positive | None = None
     """TD, error of the distance of two divots by a tracked tool"""
+    ud_mm: Positive | None = None
+    """UD, calliper error: distance of two filaments in a B-scan less the certified one"""
+    ul_mm: Positive | None = None
+    """UL, lateral resolution: width of a filament's echo along the array at -6 dB"""
+    ua_mm: Positive | None = None
+    """UA, axial resolution: the same in depth"""
 
 
 def decide(value_mm: float, expanded_mm: float, limit_mm: float) -> Decision:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from recon.acceptance import gum_budget, prescribed_places
 from recon.acceptance.certificates import Artefacts, Certified, Material
 from recon.acceptance.conformity import Decision, Limits, decide, together
+from recon.acceptance.filament_probing import Seen
 from recon.acceptance.form_probing import REPEATS, Probed, probe_plane, probe_sphere
 from recon.acceptance.gum_budget import DRAWS, Budget, Input
 from recon.acceptance.prescribed_places import Demand
@@ -51,6 +52,9 @@ CHARACTERISTICS = {
     "F95": Characteristic("flatness measurement error, 95 % of the points", "P[Form.Pla.D95%]", "f95_mm"),
     "TP": Characteristic("repeatability of a tool’s tip in a divot, RMS", "", "tp_mm"),
     "TD": Characteristic("error of divots’ distance by a tool’s tip", "", "td_mm"),
+    "UD": Characteristic("calliper error between filaments in B-scans", "", "ud_mm"),
+    "UL": Characteristic("lateral width of a filament’s echo, −6 dB", "", "ul_mm"),
+    "UA": Characteristic("axial width of a filament’s echo, −6 dB", "", "ua_mm"),
 }
 
 
@@ -71,6 +75,7 @@ class Measured(NamedTuple):
     bars: Mapping[str, tuple[Array, Array]]
     planes: Mapping[str, Array]
     divots: Mapping[str, Array] = MappingProxyType({})  # see `divot_number`
+    filaments: Mapping[str, Seen] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -159,6 +164,8 @@ def judge(
         forms(("F", "F95"), place, found, artefacts.plane.form_mm)
         middles["plane"][place] = points.mean(axis=0)
     _judge_tool(measured.divots, artefacts, add)
+    for place, seen in measured.filaments.items():
+        _judge_scanner(place, seen, artefacts, add)
     values = list[Judged]()
     for symbol, quantity in CHARACTERISTICS.items():
         limit = getattr(limits, quantity.limit)
@@ -188,7 +195,7 @@ def with_repeats(tests: Sequence[Test]) -> list[Test]:
     found = [gum_budget.linearize(test.model, test.inputs) for test in tests]
     names, groups = {test.place for test in tests}, dict[str, list[int]]()
     for number, test in enumerate(tests):
-        if not test.place.startswith("divots"):  # where another tilt of the tool has another name
+        if not test.place.startswith(("divots", "filaments")):  # whose words mean another thing, and whose images are repeats
             groups.setdefault(place_of(test.place, names), []).append(number)
     repeated = [own for own in groups.values() if len(own) > 1]
     if not repeated:
@@ -229,6 +236,38 @@ def _judge_tool(divots: Mapping[str, Array], artefacts: Artefacts, add: Callable
         words = f"{first}-{second.rpartition('/')[2]}"
         one, other = seated[first], seated[second]
         add("TD", words, one.frames + other.frames, _distance, distance_inputs((first, second), (one, other), artefacts))
+
+
+def _judge_scanner(place: str, seen: Seen, artefacts: Artefacts, add: Callable[..., None]) -> None:
+    """Callipers between all pairs of filaments, and the widths of each one's echo, by the mean of n B-scans."""
+    assert artefacts.filaments is not None
+    phantom, images = artefacts.filaments, len(seen.places)
+    third = np.sqrt(3)
+    speed = Input("speed of sound", phantom.speed_m_s, phantom.speed_limit_m_s / third, "B", "m/s", "rectangular")
+    for first, second in combinations(range(len(seen.numbers)), 2):
+        apart = (seen.places[:, second] - seen.places[:, first]) * [1.0, phantom.speed_m_s / phantom.screen.assumed_m_s]
+        lengths = np.linalg.norm(apart, axis=1)  # of each B-scan, however it is tilted
+        deep = float(np.mean((apart[:, 1] / lengths) ** 2))
+        numbers = seen.numbers[first], seen.numbers[second]
+        certified = _certified("certified distance", phantom.distance(*numbers))
+        words = f"{place}, {numbers[0]}-{numbers[1]}"
+        inputs = [_mean_of("distance, at the certified speed", lengths), speed, certified]
+        add("UD", words, images, partial(_calliper, deep, phantom.speed_m_s), inputs)
+    shown = phantom.screen.dynamic_range_db
+    scale = Input("dynamic range", shown, phantom.screen.dynamic_range_limit_db / third, "B", "dB", "rectangular")
+    for k, number in enumerate(seen.numbers):
+        for axis, (symbol, model) in enumerate(
+            (("UL", partial(_lateral, shown)), ("UA", partial(_axial, shown, phantom.screen.assumed_m_s)))
+        ):
+            widths = seen.widths[:, k, axis]
+            if np.isfinite(widths).all():
+                inputs = [_mean_of("width, as shown", widths), scale, *([speed] if symbol == "UA" else [])]
+                add(symbol, f"{place}, {number}", images, model, inputs)
+
+
+def _mean_of(name: str, values: Array) -> Input:
+    """The mean of n repeats."""
+    return Input(name, float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))), "A", freedom=len(values) - 1)
 
 
 def distance_inputs(names: tuple[str, str], seated: tuple[Seated, Seated], artefacts: Artefacts) -> list[Input]:
@@ -327,6 +366,19 @@ def _scatter(x: Mapping[str, Array]) -> Array:
 def _distance(x: Mapping[str, Array]) -> Array:
     apart = x["tip in the second divot, towards the other"] - x["tip in the first divot, towards the other"]
     return apart - x["certified distance"] * _grown(x) + x["mounting"]
+
+
+def _calliper(deep: float, speed_m_s: float, x: Mapping[str, Array]) -> Array:
+    stretched = np.sqrt(1 - deep + deep * (x["speed of sound"] / speed_m_s) ** 2)
+    return x["distance, at the certified speed"] * stretched - x["certified distance"]
+
+
+def _lateral(shown_db: float, x: Mapping[str, Array]) -> Array:
+    return x["width, as shown"] * np.sqrt(shown_db / x["dynamic range"])  # of an echo that is a parabola in dB
+
+
+def _axial(shown_db: float, assumed_m_s: float, x: Mapping[str, Array]) -> Array:
+    return _lateral(shown_db, x) * x["speed of sound"] / assumed_m_s
 
 
 def _size(x: Mapping[str, Array]) -> Array:

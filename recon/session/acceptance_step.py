@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.acceptance import artefact_points, certificate_page, certificate_sheet, optical_acceptance
+from recon.acceptance import artefact_points, certificate_page, certificate_sheet, filament_probing, optical_acceptance
 from recon.acceptance.artefact_points import Region
 from recon.acceptance.certificates import Artefacts
 from recon.acceptance.conformity import Limits
 from recon.acceptance.optical_acceptance import CHARACTERISTICS, Acceptance, Measured
 from recon.capture import surface_part, sweep_tables, tip_files
+from recon.capture.images import image_files, read_grey
 from recon.capture.manifest import MANIFEST
 from recon.errors import InputError
 from recon.files import atomic, meshes
@@ -41,7 +42,9 @@ class Settings(Part):
     capture: Path
     """folder with the folders sphere, bar and plane; each has a capture, or a mesh in mm (PLY, STL, GLB), a place: 00, 01, ...;
     and with the folder divots of a certified plate: poses of a tool in divot 00, 01, ..., a table as `sonotwin track` writes it,
-    or the folder that it wrote; 00-WORDS for another recording in divot 00, such as with the tool turned about one axis"""
+    or the folder that it wrote; 00-WORDS for another recording in divot 00, such as with the tool turned about one axis; and
+    with the folder filaments of a phantom: folders 00, 01, ... of B-scans (PNG), the probe lifted and placed again for each. A
+    sphere, bar or plane that is recorded again in its place, 00-WORDS, shows what a whole sequence shifts"""
     artefacts: Annotated[Artefacts, Choice("steel")]
     """certificates of the artefacts, and the volume: a name in conf/artefacts, or a YAML file"""
     limits: Annotated[Limits, Choice("meza2021")]
@@ -94,10 +97,11 @@ def places_of(folder: Path, artefacts: Artefacts) -> dict[str, dict[str, Path]]:
     found = {}
     for kind in artefact_points.expected(artefacts):
         own = sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else []
-        kinds = MESHES if kind != "divots" else (".csv",)
+        kinds = {"divots": (".csv",), "filaments": ()}.get(kind, MESHES)
         names = [one for one in own if not one.name.startswith(".") and (one.is_dir() or one.suffix.lower() in kinds)]
         if not names:
-            what = "a capture or mesh for each place" if kind != "divots" else "a table of poses for each divot"
+            other = {"divots": "a table of poses for each divot", "filaments": "a folder of B-scans for each setting"}
+            what = other.get(kind, "a capture or mesh for each place")
             expected = f"a folder with {what}, such as 00"
             raise InputError(f"{folder / kind}: expected {expected}, found none; artefacts.{kind}=null leaves it out")
         found[kind] = {f"{kind}/{re.sub(r'[.][^.]+$', '', one.name)}": one for one in names}
@@ -110,12 +114,22 @@ def places_of(folder: Path, artefacts: Artefacts) -> dict[str, dict[str, Path]]:
 def measure(settings: Settings, places: Mapping[str, Mapping[str, Path]], watch: Watch) -> Measured:
     """Points of the artefacts in all places."""
     region, rng = Region(cap_deg=settings.cap_deg, border_mm=settings.border_mm), np.random.default_rng(settings.seed)
-    found: dict[str, dict[str, Any]] = {"sphere": {}, "bar": {}, "plane": {}, "divots": {}}
+    found: dict[str, dict[str, Any]] = {"sphere": {}, "bar": {}, "plane": {}, "divots": {}, "filaments": {}}
     total = sum(map(len, places.values()))
     for name, path in watch.follow([pair for own in places.values() for pair in own.items()], total, "measuring"):
         artefacts = settings.artefacts
         if name.startswith("divots") and artefacts.divots is not None:
             found["divots"][name] = tips_of(path, settings.tip, name, len(artefacts.divots.places_mm))
+            continue
+        if name.startswith("filaments") and artefacts.filaments is not None:
+            images = bscans_of(path)
+            found["filaments"][name] = seen = filament_probing.probe_filaments(images, artefacts.filaments, str(path))
+            if missing := sorted(set(range(len(artefacts.filaments.places_mm))) - set(seen.numbers)):
+                watch.say(f"{name}: not in all of {len(images)} B-scans: filaments {', '.join(map(str, missing))}")
+            measured = np.isfinite(seen.widths).all(axis=(0, 2))
+            if unknown := [str(number) for number, known in zip(seen.numbers, measured, strict=True) if not known]:
+                why = "clipped, so lower the gain, or near another one"
+                watch.say(f"{name}: no widths of filaments {', '.join(unknown)}: {why}")
             continue
         points = points_of(path, settings.calibration)
         if name.startswith("sphere") and artefacts.sphere is not None:
@@ -125,7 +139,16 @@ def measure(settings: Settings, places: Mapping[str, Mapping[str, Path]], watch:
         else:
             found["plane"][name] = artefact_points.plate(points, str(path), rng, region)
     watch.say(f"measured    {', '.join(f'{len(own)} of {kind}' for kind, own in found.items() if own)}")
-    return Measured(found["sphere"], found["bar"], found["plane"], found["divots"])
+    return Measured(found["sphere"], found["bar"], found["plane"], found["divots"], found["filaments"])
+
+
+def bscans_of(folder: Path) -> list[NDArray[np.uint8]]:
+    """B-scans of a folder, of one size; InputError where one is damaged or of another size."""
+    images = list[NDArray[np.uint8]]()
+    for path in image_files(folder):
+        first = (images[0].shape[1], images[0].shape[0]) if images else None
+        images.append(read_grey(path, first))
+    return images
 
 
 def tips_of(path: Path, tip: Path | None, name: str, divots: int) -> Array:

@@ -29,6 +29,9 @@ class Config(Part):
     filament_depths_mm: tuple[Positive, ...] = (5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
     row_depth_mm: Positive = 30.0  # of a row of filaments
     row_x_mm: tuple[Finite, ...] = (-7.0, -5.0, -4.0, -3.5)
+    filaments_mm: tuple[tuple[Finite, Positive], ...] | None = (
+        None  # x from the middle, depth; in place of the column and the row
+    )
     cysts: tuple[tuple[Finite, Positive, Positive], ...] = (
         (2.0, 12.0, 5.0),
         (2.0, 25.0, 7.0),
@@ -49,6 +52,7 @@ def build(config: Config) -> Scene:
     )
     places = [(config.filament_x_mm, depth) for depth in config.filament_depths_mm]
     places += [(across, config.row_depth_mm) for across in config.row_x_mm]
+    places = places if config.filaments_mm is None else list(config.filaments_mm)
     targets = [(f"wire{k}", across, depth, config.filament_mm) for k, (across, depth) in enumerate(places)]
     for name, discs in (("cyst", config.cysts), ("bright", config.bright), ("dark", config.dark)):
         targets += [(f"{name}{k}", *disc) for k, disc in enumerate(discs)]

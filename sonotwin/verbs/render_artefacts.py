@@ -4,10 +4,12 @@ Ten spheres, seven ball bars and six planes over the volume of the certificates,
 OUT/sphere/00/capture, OUT/bar/00/capture, OUT/plane/00/capture and so on. Sizes are drawn within the certificates, and the room's
 temperature within its limits, from the seed; the artefacts' form and paint are perfect. Nothing stands behind them. Takes about
 five seconds a place on two cores for the usual rig's megapixel; with few rays a pixel, such as two, the rims of balls are noisy.
-A place that is there already is rendered again.
+A place that is there already is rendered again. Of a phantom with filaments five B-scans are rendered, OUT/filaments/00/0000.png
+and so on.
 
     sonotwin render-artefacts out=outputs/acceptance
     sonotwin render-artefacts conditions=lifelike out=outputs/acceptance
+    sonotwin render-artefacts artefacts=filaments out=outputs/scanner
 """
 
 from pathlib import Path
@@ -18,15 +20,18 @@ from pydantic import Field
 
 from recon.acceptance import prescribed_places
 from recon.acceptance.certificates import Artefacts
+from recon.capture.images import write_images
+from recon.capture.manifest import image_name
 from recon.model.part import Part
 from recon.model.patterns import Patterns
 from recon.model.rig import Rig
 from sonotwin.console_watch import LineConsole
 from sonotwin.verbs import render
 from twin.conditions import Conditions
-from twin.experiments import drawn_artefacts
+from twin.experiments import drawn_artefacts, filament_scans
 from twin.optics import surface_session
 from twin.optics.light_transport import Tracing
+from twin.ultrasound.transducer import Transducer
 
 
 class Config(Part):
@@ -41,6 +46,7 @@ class Config(Part):
     cameras: Annotated[list[surface_session.CameraName], Field(min_length=1)]
     seed: Annotated[int, Field(ge=0)]
     shooting: surface_session.Shooting
+    ultrasound: Transducer
 
 
 def run(config: Config) -> None:
@@ -48,9 +54,15 @@ def run(config: Config) -> None:
     console = LineConsole()
     for name, scene in scenes(config.artefacts, config.seed).items():
         console.print(f"place       {name}", markup=False)
-        fields = config.model_dump(exclude={"artefacts", "out"})
+        fields = config.model_dump(exclude={"artefacts", "out", "ultrasound"})
         render.run(render.Config(**fields, scene=scene, out=config.out / name))
-    console.print(f"wrote       {config.out}/{{{','.join(kind for kind in prescribed_places.LEAST)}}}", markup=False)
+    if config.artefacts.filaments is not None:
+        images = np.stack(filament_scans.render(config.artefacts.filaments, config.ultrasound, config.seed))
+        place = config.out / "filaments/00"
+        console.print(f"place       {place.relative_to(config.out)}", markup=False)
+        place.mkdir(parents=True, exist_ok=True)
+        write_images([place / image_name(number) for number in range(len(images))], images)
+    console.print(f"wrote       {config.out}", markup=False)
 
 
 def scenes(artefacts: Artefacts, seed: int) -> dict[str, dict[str, Any]]:

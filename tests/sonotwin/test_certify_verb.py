@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -90,10 +91,10 @@ def test_without_limits_values_are_reported(scanned, tmp_path):
         (["artefacts.bar.rod_mm=40"], "artefacts.bar.rod_mm: expected less than its balls' diameters, found 40"),
         (
             ["artefacts.sphere=null", "artefacts.bar=null", "artefacts.plane=null"],
-            "artefacts: expected sphere, bar, plane or divots, found none of them",
+            "artefacts: expected sphere, bar, plane, divots or filaments, found none of them",
         ),
         (["limits.sd_mm=-1"], "limits.sd_mm: expected"),
-        (["artefacts=glass"], "artefacts: expected one of divot_plate, steel"),
+        (["artefacts=glass"], "artefacts: expected one of divot_plate, filaments, steel"),
     ],
 )
 def test_mistakes_are_refused(scanned, tmp_path, capsys, fields, complaint):
@@ -166,3 +167,34 @@ def test_mistakes_about_a_tool_are_refused(tool, tmp_path, capsys, fields, compl
     assert certify(tool, tmp_path / "out", *[field.replace("TOOL", str(tool)) for field in fields]) == 2
     error = capsys.readouterr().err
     assert complaint in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_a_scanner_is_certified_by_rendered_filaments(tmp_path, capsys):
+    """What isn't measured is said; the record has callipers and widths."""
+    small = ["artefacts=filaments", "artefacts.filaments.places_mm=[[0,10],[0,20],[0,30],[10,20],[11,20]]"]
+    assert main(["render-artefacts", *small, f"out={tmp_path / 'scanner'}"]) == 0
+    assert len(list((tmp_path / "scanner/filaments/00").glob("*.png"))) == 5
+    limits = ["limits.ud_mm=0.3", "limits.ul_mm=1.2", "limits.ua_mm=0.3"]
+    assert certify(tmp_path / "scanner", tmp_path / "out", *small, *limits) == 0
+    assert "filaments/00: no widths of filaments 3, 4: clipped, so lower the gain, or near another one" in capsys.readouterr().out
+    values = json.loads((tmp_path / "out/certificate.json").read_text())["values"]
+    assert {one["quantity"] for one in values} == {"UD", "UL", "UA"}
+    assert all(abs(one["value_mm"]) < one["expanded_uncertainty_mm"] for one in values if one["quantity"] == "UD")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: [path.unlink() for path in list(folder.glob("*.png"))[2:]], "filaments/00: expected 3 B-scans or more"),
+        (lambda folder: (folder / "b.png").write_bytes(b"no"), "b.png: "),
+        (lambda folder: cv2.imwrite(str(folder / "c.png"), np.zeros((9, 9), np.uint8)), "c.png: expected 40x50"),
+    ],
+)
+def test_b_scans_that_cant_be_are_refused(spoil, said, tmp_path, capsys):
+    folder = tmp_path / "scanner/filaments/00"
+    folder.mkdir(parents=True)
+    for k in range(4):
+        cv2.imwrite(str(folder / f"a{k}.png"), np.zeros((50, 40), np.uint8))
+    spoil(folder)
+    assert certify(tmp_path / "scanner", tmp_path / "out", "artefacts=filaments") == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
