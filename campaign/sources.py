@@ -385,7 +385,7 @@ def _write_tool(folder: Path) -> None:
     for k in range(3):
         image = rng.integers(20, 40, (140, 90), dtype=np.uint8)
         for x, y in places:
-            image[int(10 * y) + k, int(10 * x) + 2 * k] = 250
+            cv2.circle(image, (int(10 * x) + 2 * k, int(10 * y) + k), 3, 240, -1)
         cv2.imwrite(str(folder / f"scanner/filaments/00/{k}.png"), cv2.GaussianBlur(image, (0, 0), 1.0))
     screen = "{mm_per_px: [0.1, 0.1]}"
     (folder / "filaments.yaml").write_text(
