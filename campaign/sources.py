@@ -145,6 +145,9 @@ COMMANDS = (
             ("tool/divots/01.csv", "divots.yaml", "small_tip.yaml")),
     Command("certify", ("capture=scanner", "artefacts=filaments.yaml"), ("scanner", "filaments.yaml"),
             ("scanner/filaments/00/1.png", "filaments.yaml")),
+    Command("score-benchmark", ("results=scored", "truth=sealed"), ("scored", "sealed"),
+            ("scored/000000-optics/calibration.yaml", "scored/000001-tracking/poses.csv",
+             "sealed/000001-tracking/sweep/film.npz")),
     Command("calibrate-target", ("capture=film/capture", "least_tilt_deg=0", "least_range_mm=0"), ("film",), _film("film")),
     Command("calibrate-tip", ("track=pivot.csv", "model=needle.stl"), ("pivot.csv", "needle.stl"), ("pivot.csv", "needle.stl")),
     Command("compare-tip", ("capture=needle/capture", "body=needle", "tip=needle_tip.yaml", "lag_s=0.05", "beside_mm=1"),
@@ -288,6 +291,7 @@ def _write_others(folder: Path) -> None:
     _write_what_is_projected(folder)
     _write_small_ones(folder)
     _write_tool(folder)
+    _write_benchmark(folder)
     _write_rig(folder / "today")
     (folder / "study.yaml").write_text("title: Rays\nof: tracking\nover:\n  film.rays: [16]\nseeds: 1\n", encoding="utf-8")
 
@@ -398,6 +402,26 @@ def _write_tool(folder: Path) -> None:
     drawn = np.array([12.0, -111.463, -155.128])  # of `scenes.handheld.looks.needle`, in its target's frame
     tip_files.write(folder / "needle_tip.yaml", Tip(drawn, np.eye(3), body="needle"))
     tip_files.write(folder / "small_tip.yaml", Tip(needle.tip, np.eye(6), needle.axis, body="needle"))
+
+
+def _write_benchmark(folder: Path) -> None:
+    """Truth of two sessions of the open benchmark, and somebody's results of these."""
+    from recon.capture import calibration_files
+    from recon.model.tracks import Track
+    from sonotwin.choices import read_rig
+    from twin.optics.surface_session import calibration_of
+
+    optics, poses, times = calibration_of(read_rig()), np.stack([np.eye(4)] * 4), np.arange(4) * 10**8
+    for name in ("000000-optics", "000001-tracking"):
+        (folder / "sealed" / name / "calibration").mkdir(parents=True, exist_ok=True)
+        (folder / "scored" / name).mkdir(parents=True, exist_ok=True)
+        calibration_files.write(folder / "sealed" / name / "calibration/optics.yaml", optics)
+    calibration_files.write(folder / "scored/000000-optics/calibration.yaml", optics)
+    sweep_tables.write_track(folder / "scored/000001-tracking/poses.csv", Track(times, poses))
+    (folder / "sealed/000001-tracking/sweep").mkdir(exist_ok=True)
+    frames = {"times_ns": times, "world_from_target": poses, "blur_px": np.zeros((4, 2, 3))}
+    frames |= {"visible": np.ones((4, 2, 3)), "inside": np.ones((4, 2, 3), bool)}
+    np.savez(folder / "sealed/000001-tracking/sweep/film.npz", **frames)
 
 
 def _write_rig(folder: Path) -> None:

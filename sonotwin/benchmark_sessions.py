@@ -6,7 +6,6 @@ Session k is of the task TASKS[k % 4]. It depends on the seed and on k alone, wh
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,13 @@ from scenes.catalogue import build_scene
 from sonotwin import choices
 from sonotwin.verbs import film, render
 from twin.conditions import Conditions, in_use
-from twin.evaluation.benchmark_results import TASKS, WANTED
+from twin.evaluation.benchmark_results import FORMAT, ROUND, TASKS, WANTED, digest, files_of
 from twin.experiments import drawn_rig
 from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.session import CAPTURE, TRUTH, Session, read_json, write_json
 from twin.tracking import film_session
 
-SESSIONS, ROUND, DESCRIPTION, SUMS = "sessions", "benchmark.json", "session.json", "checksums.sha256"
-FORMAT = "sonotwin-benchmark/1"
+SESSIONS, DESCRIPTION, SUMS = "sessions", "session.json", "checksums.sha256"
 BY = "render-benchmark"
 MOST_LIFELIKE = 1.5  # of the errors of conf/conditions/lifelike.yaml, evenly from none
 POSES, FRAMES = 8, 20  # of a board; pairs of a film
@@ -113,13 +111,13 @@ def finish(out: Path, seed: str, count: int) -> None:
         If a truth isn't the one that the round was committed to.
     """
     shutil.rmtree(out / ".making", ignore_errors=True)  # what a killed run left
-    truths = {name_of(k): _digest(out / TRUTH / name_of(k)) for k in range(count)}
+    truths = {name_of(k): digest(out / TRUTH / name_of(k)) for k in range(count)}
     for name, before in read_json(out / ROUND).get("truth_sha256", {}).items():
         if truths[name] != before:
             raise InputError(f"{out / TRUTH / name}: expected the truth of SHA-256 {before}, found another: was it edited?")
     _describe_round(out, seed, count, truths)
     with atomic.new_file(out / SUMS) as temporary:
-        lines = [f"{digest}  {SESSIONS}/{place}\n" for place, digest in _files(out / SESSIONS)]
+        lines = [f"{digest}  {SESSIONS}/{place}\n" for place, digest in files_of(out / SESSIONS)]
         temporary.write_text("".join(lines), encoding="utf-8")
 
 
@@ -140,17 +138,6 @@ def _describe_round(out: Path, seed: str, count: int, truths: dict[str, str]) ->
     }
     with atomic.new_file(out / ROUND) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def _files(folder: Path) -> Iterator[tuple[str, str]]:
-    """Places below a folder, in order, with their files' SHA-256; lists of who wrote a folder are left out."""
-    for path in sorted(path for path in folder.rglob("*") if path.is_file() and path.name != ".sonotwin.json"):
-        yield path.relative_to(folder).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _digest(folder: Path) -> str:
-    """SHA-256 of a folder's list of checksums."""
-    return hashlib.sha256("".join(f"{digest}  {place}\n" for place, digest in _files(folder)).encode()).hexdigest()
 
 
 def _drawn(rig: Rig, entropy: int) -> tuple[Rig, Conditions]:

@@ -20,7 +20,6 @@ from rich.progress import Progress
 from recon.files.occupied import occupied
 from recon.model.rig import Part
 from recon.registry import Choice
-from sonotwin import benchmark_sessions
 from sonotwin.console_watch import LineConsole
 from twin.engine import Engine, results
 
@@ -40,6 +39,8 @@ class Config(Part):
 
 def run(config: Config) -> None:
     """Render the sessions that are missing; InputError if `out` holds another round or something else."""
+    from sonotwin import benchmark_sessions  # brings the renderer, which --help can do without
+
     console, out, start = LineConsole(), config.out, perf_counter()
     with occupied(out):
         numbers = benchmark_sessions.missing(out, config.seed, config.sessions)

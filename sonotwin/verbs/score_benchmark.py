@@ -23,6 +23,7 @@ from recon.files.metrics import Metrics, shown
 from recon.model.rig import Part
 from recon.reports import page
 from twin.evaluation import benchmark_results
+from twin.session import read_json
 
 DRAWS = 2000  # of the bootstrap
 FEWEST = 5  # sessions of an interval
@@ -36,6 +37,10 @@ class Config(Part):
     """folder with a folder for each session, of the session's name"""
     truth: Path
     """truth/ of the round"""
+    round: Path | None = None
+    """benchmark.json of the round, as it was published; null takes the one beside truth/, without which nothing is checked"""
+    unchecked: bool = False
+    """score by another truth than the one that the round committed to, too"""
     out: Path
     """folder; gets scores.csv, summary.csv and scores.html"""
     title: Annotated[str, Field(max_length=200)] = "results"
@@ -46,6 +51,11 @@ def run(config: Config) -> None:
     """Score and write; InputError if a file is damaged, or a folder of results is no session's."""
     atomic.check_folder(config.out, "score-benchmark", inputs=(config.results, config.truth))
     names = sessions(config.truth)
+    committed = None if config.unchecked else commitments(config.truth, config.round)
+    if committed is None:
+        print("truth       not checked against a round's benchmark.json")
+    else:
+        check_truth(config.truth, names, committed)
     if not config.results.is_dir():
         raise InputError(f"{config.results}: expected a folder with results of sessions, found none")
     for one in sorted(path for path in config.results.iterdir() if not path.name.startswith(".")):
@@ -71,6 +81,36 @@ def sessions(truth: Path) -> list[str]:
     if not names:
         raise InputError(f"{truth}: expected the truth/ folder of a round, with folders such as 000000-optics, found none")
     return names
+
+
+def commitments(truth: Path, given: Path | None) -> dict[str, str] | None:
+    """SHA-256 of each session's truth by the round's benchmark.json; None if there is none beside the truth.
+
+    Raises
+    ------
+    InputError
+        If the file isn't one of a round.
+    """
+    path = given or truth.parent / benchmark_results.ROUND
+    if given is None and not path.is_file():
+        return None
+    there = read_json(path)
+    found = there.get("truth_sha256")
+    if there.get("format") != benchmark_results.FORMAT or not isinstance(found, dict):
+        raise InputError(f"{path}: expected a round's {benchmark_results.ROUND} with truth_sha256, found something else")
+    return found
+
+
+def check_truth(truth: Path, names: Sequence[str], committed: dict[str, str]) -> None:
+    """Check that the truth is the one that a round committed to; InputError, by the session's name, if it isn't."""
+    way = "unchecked=true scores by it all the same"
+    for name in names:
+        expected, found = committed.get(name), benchmark_results.digest(truth / name)
+        if expected is None:
+            raise InputError(f"{truth / name}: expected a session of the round, found none in {benchmark_results.ROUND}; {way}")
+        if found != expected:
+            why = "edited, damaged, or of another round?"
+            raise InputError(f"{truth / name}: expected the truth of SHA-256 {expected}, found {found}: {why} {way}")
 
 
 def summary(found: dict[str, Metrics]) -> list[tuple[str, ...]]:

@@ -135,6 +135,47 @@ def test_a_surface_is_compared_both_ways():
     assert found["to_truth_rms_mm"] < 1e-9 and found["complete_share"] == pytest.approx(0.5, abs=0.03)
 
 
+def test_a_sheet_far_away_takes_nothing_from_what_is_complete():
+    """A false sheet of a thousand times the area is false, and the true part is as complete as without it."""
+    camera = read_rig().cam1.optics.camera()
+    grid = np.stack(np.meshgrid(np.arange(-40, 40, 0.5), np.arange(-40, 40, 0.5)), axis=-1)
+    points = np.dstack([grid, np.full(grid.shape[:2], 650.0)])
+    normals, lit = np.broadcast_to([0.0, 0, -1], points.shape), np.ones(grid.shape[:2], bool)
+    true = Truth(points, normals, np.zeros(lit.shape, np.uint8), lit, points[..., :2], camera, camera, "", (), ())
+    corners = np.array([[-40, -40, 650], [39.5, -40, 650], [39.5, 39.5, 650], [-40, 39.5, 650.0]])
+    far = np.array([[32, 32, 1], [32, 32, 1], [32, 32, 1], [32, 32, 1]]) * corners + [0, 0, 300.0]
+    mesh = trimesh.Trimesh([*corners, *far], [[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], process=False)
+    found = benchmark_results.surface_figures(mesh, true)
+    assert found["complete_share"] == 1 and found["false_share"] > 0.99
+
+
+def test_a_false_pose_is_no_found_one(truth, tmp_path):
+    """Of four frames one has no pose, and one a pose 3 mm off."""
+    poses = np.stack([np.eye(4)] * 4)
+    poses[0], poses[1, 0, 3] = np.nan, 3.0
+    found = scores(truth, give(tmp_path / "results", poses=poses), tmp_path / "out")
+    assert float(found["tracking", "dropped_share"]["mean"]) == 0.5 and float(found["tracking", "false_share"]["mean"]) == 0.25
+
+
+def test_the_truth_is_the_one_that_the_round_committed_to(truth, tmp_path, capsys):
+    committed = {name: benchmark_results.digest(truth / name) for name in (OPTICS, TRACKING)}
+    path, results = tmp_path / "benchmark.json", give(tmp_path / "results", poses=np.stack([np.eye(4)] * 4))
+    assert scores(truth, results, tmp_path / "without") and "truth       not checked" in capsys.readouterr().out
+    path.write_text(json.dumps({"format": benchmark_results.FORMAT, "truth_sha256": committed}), encoding="utf-8")
+    assert scores(truth, results, tmp_path / "first") and "not checked" not in capsys.readouterr().out
+    (truth / OPTICS / "more.txt").write_text("1", encoding="utf-8")
+    arguments = ["score-benchmark", f"results={results}", f"truth={truth}", f"out={tmp_path / 'out'}"]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert f"{OPTICS}: expected the truth of SHA-256 {committed[OPTICS]}" in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists() and main([*arguments, "unchecked=true"]) == 0
+    path.write_text('{"format": "other"}', encoding="utf-8")
+    assert (
+        main([*arguments, "out=" + str(tmp_path / "again")]) == 2
+        and "benchmark.json: expected a round's" in capsys.readouterr().err
+    )
+
+
 def test_another_round_is_kept(tmp_path):
     """A folder of another seed is refused, and the seed itself isn't published."""
     benchmark_sessions.missing(tmp_path / "round", "secret", 3)

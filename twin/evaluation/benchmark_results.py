@@ -1,6 +1,7 @@
 """Results of the open benchmark as others write them, in plain files, against the sealed truth of each session."""
 
-from collections.abc import Callable, Mapping
+import hashlib
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from twin.session import TruthFolder
 
 Array = NDArray[np.float64]
 
+ROUND, FORMAT = "benchmark.json", "sonotwin-benchmark/1"  # a round's description
 TASKS = ("optics", "tracking", "surface", "ultrasound")
 WANTED = {
     "optics": "calibration.yaml, .yml, .xml or .npz: both cameras",
@@ -86,16 +88,17 @@ def _optics(results: Path, truth: Path) -> Metrics:
 
 
 def _tracking(results: Path, truth: Path) -> Metrics:
-    """Errors of poses, and drop-outs among frames that show the target whole."""
+    """Errors of poses; part of the frames that show the target whole without a right pose, and of all frames with a wrong one."""
     path = _given(results, "poses", "csv")
     if path is None:
         return {}
     expected = track_errors.read_truth(truth)
-    found = track_errors.measure(track_errors.compare(track_errors.read_track(path, expected), expected), expected)
+    errors = track_errors.compare(track_errors.read_track(path, expected), expected)
+    found, whole = track_errors.measure(errors, expected), track_errors.visible_whole(expected)
+    right = (errors.shift_mm < track_errors.FALSE_MM) & (errors.turn_deg < track_errors.FALSE_DEG)
     kept = ("shift_median_mm", "shift_p95_mm", "turn_median_deg", "turn_p95_deg")
-    whole = found["track_visible"]
     shares = {
-        "dropped_share": 1 - found["track_visible_found"] / whole if whole else np.nan,
+        "dropped_share": float(1 - right[whole].mean()) if whole.any() else np.nan,
         "false_share": found["track_false"] / found["track_frames"],
     }
     return {name: found[f"track_{name}"] for name in kept} | shares
@@ -110,7 +113,11 @@ def _surface(results: Path, truth: Path) -> Metrics:
 
 
 def surface_figures(mesh: trimesh.Trimesh, expected: surface_errors.Truth) -> Metrics:
-    """Figures of a mesh in the world: distances of its places to the true tangent planes, and completeness."""
+    """Figures of a mesh in the world: distances of its places to the true tangent planes, and completeness.
+
+    Complete is what camera 1 sees and the projector lights and has the mesh within NEAR_MM. For it the mesh's part about the
+    truth has places of its own, so that sheets far away take none from it.
+    """
     there = np.isfinite(expected.points).all(axis=-1)
     points, normals = np.float64(expected.points[there]), np.float64(expected.normals[there])
     places = np.asarray(trimesh.sample.sample_surface(mesh, MOST, seed=0)[0])
@@ -119,6 +126,10 @@ def surface_figures(mesh: trimesh.Trimesh, expected: surface_errors.Truth) -> Me
     of_it = apart < FALSE_MM
     chosen = expected.lit[::STEP, ::STEP]
     lit, outwards = (np.float64(of[::STEP, ::STEP][chosen]) for of in (expected.points, expected.normals))
+    low, high = points.min(axis=0) - FALSE_MM, points.max(axis=0) + FALSE_MM
+    about = (mesh.triangles.max(axis=1) > low).all(axis=1) & (mesh.triangles.min(axis=1) < high).all(axis=1)
+    if about.any() and not about.all():
+        places = np.asarray(trimesh.sample.sample_surface(mesh.submesh([np.flatnonzero(about)], append=True), MOST, seed=0)[0])
     back, number = nearest(surface_tree(places), lit)
     met = back < FALSE_MM
     along = np.abs(((places[number] - lit) * outwards).sum(axis=1))[met]  # not by how finely places lie on the surface
@@ -196,3 +207,14 @@ def passed(places: Array, expected: sweep_errors.SweepTruth) -> NDArray[np.bool_
         x, y, z = rigid.apply(rigid.invert(pose), places).T
         found |= (np.abs(z) < PASSED_MM) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
     return found
+
+
+def files_of(folder: Path) -> Iterator[tuple[str, str]]:
+    """Places below a folder, in order, with their files' SHA-256; lists of who wrote a folder are left out."""
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and path.name != ".sonotwin.json"):
+        yield path.relative_to(folder).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def digest(folder: Path) -> str:
+    """SHA-256 of a folder's list of checksums."""
+    return hashlib.sha256("".join(f"{digest}  {place}\n" for place, digest in files_of(folder)).encode()).hexdigest()
