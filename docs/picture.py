@@ -1,5 +1,9 @@
-"""Make the README's pictures from what `make demo` left in outputs/demo: `.venv/bin/python docs/picture.py`."""
+"""Make the README's pictures from what `make demo` left in outputs/demo: `.venv/bin/python docs/picture.py`.
 
+`docs/picture.py FILM` makes the gallery's frames from a film, such as `sonotwin film path=pivot frames=200 out=FILM`.
+"""
+
+import sys
 from pathlib import Path
 
 import cv2
@@ -79,6 +83,19 @@ def shown(points: np.ndarray) -> list[np.ndarray]:
     return [points[..., 0], -points[..., 1], -points[..., 2]]
 
 
+def frames(film: Path) -> None:
+    """Three frames of camera 1, brightened as one would on a screen, and one as it is."""
+    paths = sorted((film / "capture/sweep/cam1").glob("*.png"))
+    images = [cv2.imread(str(paths[k * (len(paths) - 1) // 3]), cv2.IMREAD_GRAYSCALE) for k in range(4)]
+    shown = [images[0], *(np.uint8(np.rint(255 * (image / 255) ** 0.5)) for image in images[1:])]
+    small = [cv2.resize(image, (480, 384), interpolation=cv2.INTER_AREA) for image in shown]
+    packing = [cv2.IMWRITE_JPEG_QUALITY, 85]
+    cv2.imwrite("docs/images/frames.jpg", np.vstack([np.hstack(small[:2]), np.hstack(small[2:])]), packing)
+
+
 if __name__ == "__main__":
-    outside()
-    inside()
+    if len(sys.argv) > 1:
+        frames(Path(sys.argv[1]))
+    else:
+        outside()
+        inside()
