@@ -54,9 +54,10 @@ class Subject(NamedTuple):
 
 def write_text(found: Acceptance, subject: Subject) -> str:
     """The page as HTML."""
+    arrangement = [page.table(DEMAND_HEAD, demand_rows(found)), page.drawing(_map(found, subject), *_MAP)]
     sections = [
         Section("Test values", [page.table(HEAD, result_rows(found)), page.drawing(_plot(found), *_plotted(found))]),
-        Section("Arrangement", [page.table(DEMAND_HEAD, demand_rows(found)), page.drawing(_map(found, subject), *_MAP)]),
+        *([Section("Arrangement", arrangement)] if found.demands else []),
         Section("Uncertainty budgets", _budgets(found)),
         Section("Artefacts", [page.table(ARTEFACT_HEAD, artefact_rows(subject.artefacts), room(subject.artefacts))]),
         Section("All places", [page.table(("quantity", "place", "points", "decision", "error ± U"), place_rows(found))]),
@@ -196,7 +197,11 @@ def _listed(symbols: Sequence[str]) -> str:
 
 def _figures(found: Acceptance) -> list[tuple[str, str, str]]:
     numbers = [(symbol, f"{one.budget.value_mm:.3f}".replace("-", "−"), "mm") for symbol, one in found.worst_values.items()]
-    return [*numbers, ("demands met", f"{sum(one.met for one in found.demands)} of {len(found.demands)}", "")]
+    return (
+        numbers
+        if not found.demands
+        else [*numbers, ("demands met", f"{sum(one.met for one in found.demands)} of {len(found.demands)}", "")]
+    )
 
 
 def _plotted(found: Acceptance) -> tuple[str, str]:

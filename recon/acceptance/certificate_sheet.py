@@ -113,7 +113,7 @@ def _content(found: Acceptance, subject: Subject) -> list[Flowable]:
         KeepTogether([Paragraph("Signed", SECTION), _table(("", ""), signed, (90, width - 90), high=19)]),
         KeepTogether([Paragraph("Artefacts", SECTION), _table(ARTEFACT_HEAD, artefacts, (160, 120, 120)),
                       Paragraph(certificate_page.room(subject.artefacts), SMALL)]),
-        KeepTogether([Paragraph("Arrangement", SECTION), _table(DEMAND_HEAD, demands, (220, 160, 60))]),
+        *([KeepTogether([Paragraph("Arrangement", SECTION), _table(DEMAND_HEAD, demands, (220, 160, 60))])] if demands else []),
         *tables,
         KeepTogether([Paragraph("How to read this", SECTION), *[Paragraph(_safe(text), SMALL) for text in READING]]),
     ]  # fmt: skip
