@@ -4,7 +4,8 @@ A patient has a rig, a hand and tissue of her own, and some cores. The planned p
 session. The needle's tip is by the same cameras, so what errs alike in both cancels. All errors are vectors in the world, of the
 tip less the mass as it lies at that moment, and add up; without one of them the others stay as they were.
 
-The planned place is that of a drawn session (`drawn_session`, the real software after the detectors), and so is the needle's tip.
+The planned place is drawn (`drawn_session`, the real software after the detectors), or rendered whole: board, wires and a filmed
+sweep over a patient, from whose images the real software calibrates, tracks and segments. All else is drawn, the same in both.
 
 Sources, beside what is assumed: speed of sound in whole breasts, 1463 +- 29 m/s in 43 volunteers [ultrasound tomography 2017];
 novices' distance of the tip from the target, 4.26 +- 2.87 mm, in a phantom by electromagnetic navigation [Na 2013]; attending
@@ -26,14 +27,23 @@ from recon.geometry import rigid
 from recon.model import circle_layout
 from recon.model.calibration import DRIFT_PX, PRINT_SCALE, Calibration, in_use
 from recon.model.rig import Rig, Target
+from recon.optical_calibration.joint_calibration import calibrate
 from recon.tip_calibration import pivot
 from scenes.acoustics import TISSUES
 from scenes.anatomy import GLANDULAR, Density
 from twin import conditions
-from twin.experiments import chain_trial, drawn_session, patient_trial
+from twin.evaluation import sweep_errors
+from twin.experiments import calibration_trial, chain_trial, drawn_session, patient_trial, rehearsal
+from twin.experiments.board_sets import rendered
 from twin.experiments.drawn_session import Eye, pair
 from twin.experiments.experiment_runs import Biopsy, Experiment, Settings
+from twin.experiments.rehearsal import Stage
+from twin.filmed_sweep import SweepSettings, plan_sweep
 from twin.living.living_body import breath, pulse
+from twin.optics.surface_session import calibration_of
+from twin.shooting import FrameShooting
+from twin.ultrasound.probe_path import SurfacePath
+from twin.ultrasound.timed_sweep import Clocks
 from twin.working_range import working_range
 
 Array = NDArray[np.float64]
@@ -58,6 +68,10 @@ LATENCY_S = 0.1  # from a frame to the screen and the hand; assumed
 PUSHED_MM = 0.5  # standard deviation of a mass's way before the needle, in scattered tissue; assumed
 SHIFT_MM = 0.5  # along each axis, by which she has moved since the scan, and isn't tracked; assumed
 SOFTER = {"fatty": 1.4, "scattered": 1.0, "heterogeneous": 0.85, "dense": 0.7}  # tissue, which yields by that much more; assumed
+STROKE = SurfacePath(start_mm=(-14.0, -24.0), end_mm=(-14.0, 24.0), speed_mm_s=15.0, standoff_mm=-2.0)
+CLOCKS = Clocks(scanner_hz=15.0, camera_hz=7.5)
+HIGH_MM = 42.0  # of the skin there over the chest, to a millimetre in four patients
+MASS = {"size_mm": 14.0, "form": "oval", "pattern": "hypoechoic"}  # under the stroke
 ARM = ("rig", "training", "tissue")  # fields that patients of one arm share
 
 
@@ -83,7 +97,7 @@ class Planned(NamedTuple):
 
 
 def key_of(biopsy: Biopsy, seed: int) -> list[int]:
-    """Of a patient's random numbers: others in each arm of the trial."""
+    """Of a patient's random numbers: others in each arm of the trial, and alike for a place that is drawn and one rendered."""
     levels = (get_args(Biopsy.model_fields[name].annotation).index(getattr(biopsy, name)) for name in ARM)
     return [seed, *levels]
 
@@ -93,7 +107,7 @@ def measure(settings: Settings, seed: int) -> Metrics:
     key = key_of(settings.biopsy, seed)
     number = int(np.random.SeedSequence(key).generate_state(1)[0] >> 1)
     of = rig_of(settings)
-    planned = planned_place(of, number, key)
+    planned = (rendered_place if settings.biopsy.measured == "rendered" else drawn_place)(of, number, key)
     return figures(planned.errors, needle_errors(of, planned, number, key))
 
 
@@ -138,7 +152,7 @@ def speed_of(tissue: Density, rng: np.random.Generator) -> float:
     return 1 / (gland / TISSUES["gland"].speed + (1 - gland) / TISSUES["fat"].speed)
 
 
-def planned_place(settings: Settings, number: int, key: list[int]) -> Planned:
+def drawn_place(settings: Settings, number: int, key: list[int]) -> Planned:
     """The centre of a mass by a drawn session; the scan's own error as of rendered patients."""
     where, rng = working_range(settings.rig), np.random.default_rng([*key, 70])
     sound = settings.conditions.sound.model_copy(update={"tissue": 0.0})
@@ -150,6 +164,50 @@ def planned_place(settings: Settings, number: int, key: list[int]) -> Planned:
     by_rig = chain_trial.mass_error(found)
     by_sound = chain_trial.mass_error(replace(found, true_probe=true)) - by_rig
     return Planned({"rig": by_rig, "sound": by_sound, "scan": SCAN_MM * rng.standard_normal(3)}, found.used, found.optics)
+
+
+def rendered_place(settings: Settings, number: int, key: list[int]) -> Planned:
+    """The centre of a mass by rendered images of board, wires and a patient.
+
+    Raises
+    ------
+    InputError
+        If the mass isn't found, or something is refused.
+    """
+    alone = settings.model_copy(update={"rig": settings.rig.model_copy(update={"bodies": {}})})
+    seen = rendered(calibration_trial.session(alone, number))
+    optics = calibrate(seen.sightings, seen.board, seen.sizes).adjustment.calibration
+    stage = Stage(alone, optics, settings.ultrasound.dynamic_range_db, number)
+    probe = rehearsal.calibrate(stage, 1).results[0].calibration
+    planned = plan_sweep(
+        SweepSettings(
+            rig=alone.rig,
+            scene=patient(settings.biopsy.tissue, number, key),
+            ultrasound=settings.ultrasound,
+            path=STROKE,
+            living=LIVING,
+            conditions=settings.conditions.model_copy(update={"sound": conditions.Sound()}),
+            clocks=CLOCKS,
+            name="scan",
+            filmed=True,
+            frames=FrameShooting(white_dn=settings.film.white_dn, quality=rehearsal.QUALITY),
+            seed=number,
+        )
+    )
+    skin = next(thing.mesh for thing in planned.scene.things if thing.name == "breast")
+    track = rehearsal.tracked(stage, planned)[0]
+    error = rehearsal.mass_errors(stage, planned, track, [probe], TOLD_M_S, sweep_errors.facing(skin)).centre_mm[0]
+    if not np.isfinite(error).all():
+        raise InputError("masses: expected the one that was scanned, found none where it lies, so nothing is planned")
+    used = calibration_of(conditions.drifted(alone.rig, settings.conditions.drift, number))
+    return Planned({"scan": error}, used, optics)
+
+
+def patient(tissue: str, number: int, key: list[int]) -> dict:
+    """A patient with a mass under the stroke, as deep as the drawn ones."""
+    aside = np.random.default_rng([*key, 71]).uniform(-3.0, 3.0, 2)
+    mass = MASS | {"centre_mm": (float(STROKE.start_mm[0] + aside[0]), float(aside[1]), HIGH_MM - DEEP_MM)}
+    return {"kind": "patient", "seed": number, "edge_mm": 1.5, "anatomy": {"density": tissue}, "masses": [mass]}
 
 
 def needle_errors(settings: Settings, planned: Planned, number: int, key: list[int]) -> dict[str, Array]:
@@ -251,10 +309,17 @@ def target_of(rig: Rig) -> Target:
 EXPERIMENT = Experiment(
     (
         "rig",
+        "board",
+        "board_patterns",
         "poses",
         "conditions",
+        "tracing",
+        "shooting",
+        "film.white_dn",
         "noise",
+        "wire_path",
         "ultrasound",
+        "ranges",
         "biopsy",
     ),
     measure,

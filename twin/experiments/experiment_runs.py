@@ -96,6 +96,9 @@ class Biopsy(Part):
     rig: Literal["identified", "data_sheet", "worn"] = "data_sheet"  # how well it is known
     training: Literal["novice", "trained"] = "trained"  # of the hand that leads the needle
     tissue: Density = "scattered"
+    measured: Literal["drawn", "rendered"] = (
+        "drawn"  # how the planned place is found: by drawn detections, or from rendered images
+    )
 
 
 class Settings(Part):

@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from recon.capture.images import write_images
@@ -361,14 +362,21 @@ def masses(stage: Stage, number: int) -> PlannedSweep:
     return plan_sweep(_sweep(stage, f"masses{number}", scene, stage.settings.ultrasound, STROKE, SWEPT))
 
 
-def mass_errors(stage: Stage, planned: PlannedSweep, track: Track, probes: Sequence[ProbeCalibration]) -> MassErrors:
-    """Segment a sweep by each of some calibrations, told the usual speed of sound in the tissue, and compare."""
+def mass_errors(
+    stage: Stage,
+    planned: PlannedSweep,
+    track: Track,
+    probes: Sequence[ProbeCalibration],
+    tissue_m_s: float = TISSUE_M_S,
+    skin: trimesh.Trimesh | None = None,
+) -> MassErrors:
+    """Segment a sweep by each of some calibrations, told a speed of sound in the tissue, and the skin if given, and compare."""
     found, method = list[MassErrors](), Method(dynamic_range_db=stage.dynamic_range_db, overlays=0)
     with TemporaryDirectory() as folder:
         sweep = recorded(planned, (scan.image for scan in planned.scans()), track, Path(folder))
         for probe in probes:
-            scans = freehand_scans.of_sweep(sweep, probe, SWEPT.lag_s, TISSUE_M_S)
-            meshes = masses_step.find(freehand_scans.in_memory(scans), method).meshes
+            scans = freehand_scans.of_sweep(sweep, probe, planned.settings.clocks.lag_s, tissue_m_s)
+            meshes = masses_step.find(freehand_scans.in_memory(scans), method, skin).meshes
             pairs = sweep_errors.compare(list(meshes.values()), [thing for thing in planned.scene.things if thing.inside])
             none = np.full(3, np.nan)
             centres = [none if one.found is None else one.found.center_mass - one.true.center_mass for one in pairs]

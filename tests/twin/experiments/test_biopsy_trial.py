@@ -97,11 +97,15 @@ def test_without_any_error_the_needle_meets_the_mass(trial, monkeypatch):
     assert found["distance_mm"] < 0.05 and found["within_1_mm"] == found["cores"] == 2
 
 
-def test_a_patient_is_the_same_again_and_another_one_in_another_arm(trial):
+def test_a_patient_is_the_same_again_and_another_one_in_another_arm(trial, monkeypatch):
+    """Also where the planned place is rendered: all else is as it was."""
     first = biopsy_trial.measure(trial, 5)
     assert biopsy_trial.measure(trial, 5) == first
     other = trial.model_copy(update={"biopsy": Biopsy(rig="worn")})
     assert biopsy_trial.measure(other, 5)["distance_mm"] != first["distance_mm"]
+    monkeypatch.setattr(biopsy_trial, "rendered_place", biopsy_trial.drawn_place)
+    rendered = trial.model_copy(update={"biopsy": Biopsy(measured="rendered")})
+    assert biopsy_trial.measure(rendered, 5) == first
 
 
 def test_gland_is_faster_than_fat_and_moves_less():
