@@ -1,6 +1,7 @@
 """What a person sees of the command line: help, and one line for each mistake."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -161,7 +162,7 @@ def test_help_waits_for_no_library():
 
 def test_version(capsys):
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out.startswith("sonotwin 0.")
+    assert re.fullmatch(r"sonotwin \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 def test_unknown_verb(capsys):
